@@ -1,0 +1,1 @@
+"""The tasks, and the single and vector environments that run them."""
