@@ -15,7 +15,7 @@ class Sampler(Protocol):
     """The least a distribution needs: enough for the wrappers, which only draw."""
 
     def sample(self, n: int, rng: np.random.Generator) -> Array:
-        """n draws of the physical values, (n, d)."""
+        """Draw n vectors of physical values, (n, d)."""
         ...
 
 
