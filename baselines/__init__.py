@@ -1,0 +1,1 @@
+"""Trainers and experiments that compose `simopt_envs` and `wrappers`; nothing imports them."""
