@@ -13,6 +13,7 @@ XML = """
   <worldbody>
     <body name="cart" pos="1 0 0">
       <joint name="slide" type="slide" axis="1 0 0" damping="2" frictionloss="0.5"/>
+      <geom size="0.1" contype="0" conaffinity="0" mass="0"/>
       <geom name="box" type="box" size=".1 .1 .1" mass="3"/>
       <body name="pole" pos="0 0 .1">
         <joint name="hinge" axis="0 1 0" damping="0.1"/>
@@ -117,6 +118,7 @@ def test_names_are_unique():
     [
         (Write("dof_dampin", "slide"), "did you mean 'dof_damping'"),
         (Write("dof_damping", "slid"), "unknown joint 'slid'; did you mean 'slide'"),
+        (Write("geom_size", "bix"), "Valid names: box, rod"),
         (Write("dof_damping"), "needs the name of the object"),
         (Write("body_pos", "cart", (3,)), "index"),
     ],

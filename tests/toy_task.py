@@ -34,7 +34,10 @@ class ToyTask:
                 1.0,
                 0.1,
                 10.0,
-                writes=(Write("body_mass", "cart", operation="scale"), Write("body_inertia", "cart", operation="scale")),
+                writes=(
+                    Write("body_mass", "cart", operation="scale"),
+                    Write("body_inertia", "cart", operation="scale"),
+                ),
             ),
         ]
     )
@@ -44,7 +47,7 @@ class ToyTask:
     camera = "side"
     discrepancy_weights = np.ones(1)
 
-    def make_model(self):
+    def make_model(self, visual=True):
         return mujoco.MjModel.from_xml_string(XML)
 
     def initial_qpos(self, rng):

@@ -27,6 +27,18 @@ _OBJECT_OF_FIELD = {
     "sensor": mujoco.mjtObj.mjOBJ_SENSOR,
     "numeric": mujoco.mjtObj.mjOBJ_NUMERIC,
 }
+_COUNT = {
+    mujoco.mjtObj.mjOBJ_BODY: "nbody",
+    mujoco.mjtObj.mjOBJ_JOINT: "njnt",
+    mujoco.mjtObj.mjOBJ_GEOM: "ngeom",
+    mujoco.mjtObj.mjOBJ_SITE: "nsite",
+    mujoco.mjtObj.mjOBJ_PAIR: "npair",
+    mujoco.mjtObj.mjOBJ_EQUALITY: "neq",
+    mujoco.mjtObj.mjOBJ_TENDON: "ntendon",
+    mujoco.mjtObj.mjOBJ_ACTUATOR: "nu",
+    mujoco.mjtObj.mjOBJ_SENSOR: "nsensor",
+    mujoco.mjtObj.mjOBJ_NUMERIC: "nnumeric",
+}
 # MuJoCo lists the fields that mj_setConst reads from 4.0 on; before that it is run after every write.
 _SETCONST_INPUTS: frozenset[str] | None = (
     frozenset(mujoco.MjModel._setconst_inputs) if hasattr(mujoco.MjModel, "_setconst_inputs") else None
@@ -150,7 +162,7 @@ def _object_rows(model: mujoco.MjModel, write: Write) -> slice:
     obj = _OBJECT_OF_FIELD[kind]
     i = mujoco.mj_name2id(model, obj, write.object)
     if i < 0:
-        names = _object_names(model, obj)
+        names = _object_names(model, obj, int(getattr(model, _COUNT[obj])))
         raise ValueError(unknown_name(obj.name.removeprefix("mjOBJ_").lower(), write.object, names))
     if kind == "dof":
         start, end = _span(model.jnt_dofadr, i, model.nv)
@@ -168,11 +180,9 @@ def _span(addresses: np.ndarray, i: int, total: int) -> tuple[int, int]:
     return int(addresses[i]), int(addresses[i + 1]) if i + 1 < len(addresses) else total
 
 
-def _object_names(model: mujoco.MjModel, obj: mujoco.mjtObj) -> list[str]:
-    names: list[str] = []
-    while (name := mujoco.mj_id2name(model, obj, len(names))) is not None:
-        names.append(name)
-    return names
+def _object_names(model: mujoco.MjModel, obj: mujoco.mjtObj, count: int) -> list[str]:
+    names = (mujoco.mj_id2name(model, obj, i) for i in range(count))
+    return [name for name in names if name is not None]
 
 
 def _plans(model: mujoco.MjModel, space: ParameterSpace) -> Iterator[tuple[str, _FieldPlan]]:

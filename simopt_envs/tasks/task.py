@@ -50,8 +50,8 @@ class Task(Protocol):
     camera: str
     discrepancy_weights: Array
 
-    def make_model(self) -> mujoco.MjModel:
-        """A fresh model at nominal ξ."""
+    def make_model(self, visual: bool = True) -> mujoco.MjModel:
+        """A fresh model at nominal ξ; without ``visual`` it lacks what is there only to be seen, and steps faster."""
         ...
 
     def initial_qpos(self, rng: np.random.Generator) -> Array:

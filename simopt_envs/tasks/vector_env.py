@@ -57,7 +57,7 @@ class TaskVectorEnv(gym.vector.VectorEnv[Array, Array, NDArray[Any]]):
         self.task = task
         self.num_envs = num_envs
         self.max_episode_steps = max_episode_steps
-        self.simulation = BatchSimulation(task.make_model(), task.parameters, num_envs, num_threads)
+        self.simulation = BatchSimulation(task.make_model(visual=False), task.parameters, num_envs, num_threads)
         self.parameters: ParameterSpace = task.parameters
         self.parameter_source: Callable[[Worlds], Array] | None = None
         self.discrepancy_weights = task.discrepancy_weights
