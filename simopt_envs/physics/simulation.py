@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from simopt_envs.physics.parameters import Array, ParameterSpace
 from simopt_envs.physics.writer import ModelWriter, model_field
 
+_POSITIONS = int(mujoco.mjtStage.mjSTAGE_POS)
 _DIVERGED = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
 
 
@@ -43,7 +44,7 @@ class Simulation(Protocol):
     def step(self, ctrl: Array, substeps: int) -> NDArray[np.bool_]:
         """Hold ``ctrl`` (n, nu) for some steps of the model; return which worlds diverged, (n,).
 
-        Positions and velocities, and what follows from them, are current afterwards.
+        Positions, what follows from them, and velocities are current afterwards.
         """
         ...
 
@@ -116,14 +117,18 @@ class BatchSimulation:
             ) from None
         self.model = model
         self.num_worlds = num_worlds
-        self._batch = Batch(model, num_worlds, num_threads, persistent=True)
+        self._batch = Batch(model, num_worlds, num_threads)
         self._writer = ModelWriter(model, space)
         self._history = _CommandHistory(model)
+        self._bound: dict[str, np.ndarray] = {}
         self._fields = {name: self._batch.expand(name) for name in self._writer.fields}
 
     def data(self, field: str) -> np.ndarray:
         """See :meth:`Simulation.data`."""
-        return self._batch.bind(field)
+        if field not in self._bound:
+            self._bound[field] = self._batch.bind(field)
+            self._batch.forward(stage=_POSITIONS)  # what is bound between calls is zero until the next one
+        return self._bound[field]
 
     def model_field(self, field: str) -> np.ndarray:
         """See :meth:`Simulation.model_field`."""
@@ -157,14 +162,16 @@ class BatchSimulation:
         self._batch.bind("ctrl")[:] = ctrl
         failed = np.zeros(self.num_worlds, dtype=bool)
         try:
-            self._batch.step(nstep=substeps, stage=int(mujoco.mjtStage.mjSTAGE_VEL))
+            self._batch.step(nstep=substeps, stage=_POSITIONS)
         except SimulationError as error:
             failed[error.ids] = True
         return failed | (self._warnings() != before)
 
     def world(self, index: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
-        """One world's model and data, to render or inspect."""
-        return self._batch.get_model(index), self._batch.get_data(index)
+        """One world's model and data, to render or inspect; they do not follow it."""
+        model, data = self._batch.get_model(index), self._batch.get_data(index)
+        mujoco.mj_forward(model, data)
+        return model, data
 
     def _warnings(self) -> NDArray[np.int64]:
         return self._batch.warning[:, [int(w) for w in _DIVERGED], 1].sum(axis=1)

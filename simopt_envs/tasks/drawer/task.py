@@ -20,6 +20,7 @@ OPEN = 0.2  # m, a drawer this far out counts as open
 PULL = 0.25  # m, as far as the reward asks to pull: a margin beyond OPEN
 _GRIP_DEPTH = 0.022  # m, how far along the fingers the bar may lie from the grasp point and still be held
 _GRIP_SLACK = 0.004  # m, how much wider than the bar the closed fingers may stand
+_LOOSE = 0.03  # m, standing wider than the bar by this much, the fingers earn nothing for being around it
 
 
 class DrawerTask:
@@ -59,7 +60,6 @@ class DrawerTask:
         self._grasp, self._handle = model.site("grasp").id, model.site("handle").id
         self._fingers = [model.joint(name).qposadr[0] for name in ("finger_left", "finger_right")]
         self._bar_radius, self._bar_half_length = model.geom("handle").size[:2]
-        self._widest_gap = 2.0 * (self._gripper_range[1] - self._bar_radius)
 
     def make_model(self, visual: bool = True) -> mujoco.MjModel:
         """See :meth:`Task.make_model`."""
@@ -120,13 +120,14 @@ class DrawerTask:
         )
         gap = left + right - 2.0 * self._bar_radius
         held = around & (gap < _GRIP_SLACK)
+        grip = around * np.clip(1.0 - gap / _LOOSE, 0.0, 1.0)
         # The fingers are to point into the cabinet (+x) and to close along z, across the horizontal bar.
         misaligned = (1.0 - hand[:, 0, 2]) + (1.0 - np.abs(hand[:, 2, 1]))
         measures = {
             "distance": np.linalg.norm(to_handle, axis=1),
             "angle": misaligned,
-            "opening": np.clip(opening * around, 0.0, PULL),
-            "grasp": around * np.clip(1.0 - gap / self._widest_gap, 0.0, 1.0),
+            "opening": np.clip(opening, 0.0, PULL) * grip,
+            "grasp": grip,
             "action": np.sum(action**2, axis=1),
         }
         terms = {name: self.weights[name] * value for name, value in measures.items()}

@@ -1,0 +1,106 @@
+"""Adapting to recordings: their commands replayed in a model, window by window."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields, replace
+from typing import Any
+
+import mujoco
+import numpy as np
+from gymnasium.vector import VectorEnv
+from numpy.typing import NDArray
+
+from simopt_envs.adaptation.protocols import Policy
+from simopt_envs.adaptation.rollouts import Rollouts
+from simopt_envs.distributions.distribution import Sampler
+from simopt_envs.measured.states import States
+from simopt_envs.measured.trajectory import Trajectory
+from simopt_envs.measured.windows import Windows, WindowSimulator
+from simopt_envs.physics.parameters import Array, ParameterSpace
+
+
+def window_trajectories(windows: Windows) -> list[Trajectory]:
+    """The windows as trajectories, for :class:`RecordedSystem`; those that begin with a missing value left out.
+
+    Observations are the compared channels, actions the commands at their sampling rate.
+    """
+    return [
+        Trajectory(measured, commands[:: windows.stride])
+        for measured, commands in zip(windows.measured, windows.commands, strict=True)
+        if np.isfinite(measured[0]).all()
+    ]
+
+
+class ReplaySimulator:
+    """Runs a model through windows of recordings, from the states estimated at their starts. There is no policy.
+
+    Args:
+        model: the model; it is not changed.
+        parameters: ξ.
+        windows: those that the real system's trajectories come from (:func:`window_trajectories`).
+        num_threads: 0 for one per core.
+
+    Attributes:
+        discrepancy_weights: (c,), the inverse of each channel's standard deviation, so that units do not matter.
+    """
+
+    def __init__(self, model: mujoco.MjModel, parameters: ParameterSpace, windows: Windows, num_threads: int = 0):
+        self.parameters = parameters
+        self.observation_names = windows.names
+        scale = windows.channel_scale()
+        self.discrepancy_weights: Array | None = 1 / np.where(scale > 0, scale, 1.0)
+        self._model, self._windows, self._num_threads = model, windows, num_threads
+        self._index = {measured.tobytes(): i for i, measured in enumerate(windows.measured)}
+        self._simulator: tuple[tuple[int, ...], ParameterSpace, WindowSimulator] | None = None
+
+    def identity(self) -> dict[str, Any]:
+        """What identifies it in a checkpoint."""
+        return {"parameters": list(self.parameters.names), "windows": len(self._windows)}
+
+    def make_vector_env(self, num_envs: int, distribution: Sampler, seed: int) -> VectorEnv:
+        """There is nothing to train in.
+
+        Raises:
+            ValueError: always.
+        """
+        raise ValueError("recordings are replayed without a policy: give SimOpt trainer=None")
+
+    def rollout(
+        self, policy: Policy | None, space: ParameterSpace, xi: Array, real: Sequence[Trajectory], seed: int
+    ) -> Rollouts:
+        """Replay the windows that the r trajectories ``real`` are, for n ξ; leading axes (n, r).
+
+        Raises:
+            ValueError: for a trajectory that is none of the windows.
+        """
+        observations = self._simulate(tuple(map(self._find, real)), space)(xi)
+        n, r, samples = observations.shape[:3]
+        actions = np.broadcast_to(np.stack([t.actions for t in real]), (n, r, *real[0].actions.shape))
+        diverged = np.asarray(np.isnan(observations).any(axis=(2, 3)))
+        return Rollouts(observations, actions, np.full((n, r), samples - 1), diverged, None)
+
+    def _find(self, trajectory: Trajectory) -> int:
+        index = self._index.get(trajectory.observations.tobytes())
+        if index is None:
+            raise ValueError("a trajectory to replay is none of the simulator's windows")
+        return index
+
+    def _simulate(self, chosen: tuple[int, ...], space: ParameterSpace) -> WindowSimulator:
+        """The simulator of some windows; the last one is kept, as updates come several on the same windows."""
+        if self._simulator is None or self._simulator[:2] != (chosen, space):
+            windows = _select(self._windows, np.array(chosen))
+            self._simulator = chosen, space, WindowSimulator(self._model, windows, space, self._num_threads)
+        return self._simulator[2]
+
+
+def _select(windows: Windows, chosen: NDArray[np.intp]) -> Windows:
+    """Some of the windows."""
+    starts = States(*(getattr(windows.starts, field.name)[chosen] for field in fields(States)))
+    per_window = ("start_time", "measured", "commands", "past_commands")
+    return replace(
+        windows,
+        recording=tuple(windows.recording[i] for i in chosen),
+        starts=starts,
+        **{name: getattr(windows, name)[chosen] for name in per_window},
+    )

@@ -1,0 +1,124 @@
+"""Running many episodes of a policy side by side, and what they leave behind."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import VectorEnv
+from numpy.typing import NDArray
+
+from simopt_envs.adaptation.protocols import Policy
+from simopt_envs.measured.trajectory import Trajectory
+from simopt_envs.physics.parameters import Array
+
+
+@dataclass(frozen=True)
+class Rollouts:
+    """Episodes of up to T steps; the leading axes, here ``...``, count them.
+
+    Attributes:
+        observations: (..., T + 1, o), NaN after an episode's end and where a sensor dropped out.
+        actions: (..., T, a), NaN after an episode's end.
+        lengths: (...), steps of each episode.
+        diverged: (...), whether the simulation broke down.
+        success: (...), whether the episode ended in success; None where the environment does not tell.
+    """
+
+    observations: Array
+    actions: Array
+    lengths: NDArray[np.int64]
+    diverged: NDArray[np.bool_]
+    success: NDArray[np.bool_] | None
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Rollouts]) -> Rollouts:
+        """Joined along the first axis; the shorter ones padded with NaN."""
+        steps = max(part.actions.shape[-2] for part in parts)
+
+        def padded(arrays: Iterable[Array], length: int) -> Array:
+            return np.concatenate(
+                [
+                    np.pad(x, [*[(0, 0)] * (x.ndim - 2), (0, length - x.shape[-2]), (0, 0)], constant_values=np.nan)
+                    for x in arrays
+                ]
+            )
+
+        return cls(
+            padded((part.observations for part in parts), steps + 1),
+            padded((part.actions for part in parts), steps),
+            np.concatenate([part.lengths for part in parts]),
+            np.concatenate([part.diverged for part in parts]),
+            None
+            if any(part.success is None for part in parts)
+            else np.concatenate([part.success for part in parts if part.success is not None]),
+        )
+
+    def map(self, function: Callable[[np.ndarray], np.ndarray]) -> Rollouts:
+        """Every array sent through a function of its leading axes, to pick episodes or to reshape."""
+        return Rollouts(
+            function(self.observations),
+            function(self.actions),
+            function(self.lengths),
+            function(self.diverged),
+            None if self.success is None else function(self.success),
+        )
+
+    def trajectory(self, *index: int) -> Trajectory:
+        """One of the episodes."""
+        steps = int(self.lengths[index])
+        return Trajectory(
+            self.observations[index][: steps + 1].copy(),
+            self.actions[index][:steps].copy(),
+            None if self.success is None else bool(self.success[index]),
+        )
+
+
+def run_episodes(
+    env: VectorEnv,
+    policy: Policy,
+    max_steps: int | None = None,
+    *,
+    seed: list[int],
+    options: dict[str, Any] | None = None,
+    sensor: Callable[[Array], Array] | None = None,
+) -> Rollouts:
+    """Run one episode in every world of a vector environment that resets its worlds by itself in the next step.
+
+    Args:
+        env: n worlds.
+        policy: decides on all of them at once.
+        max_steps: longest episode; None leaves it to the environment.
+        seed: of each world's episode, n.
+        options: of ``reset``.
+        sensor: observations (n, o) -> what is measured of them, NaN where nothing is: there the policy goes on seeing
+            the last value. None measures exactly.
+
+    Returns:
+        Rollouts with one leading axis, n.
+    """
+    measure = sensor or (lambda observation: observation)
+    first, _ = env.reset(seed=seed, options=options)  # type: ignore[arg-type]  # a list, as every VectorEnv takes it
+    seen = measure(np.array(first, dtype=np.float64))
+    n = env.num_envs
+    observations, actions = [seen], list[Array]()
+    lengths = np.zeros(n, dtype=np.int64)
+    running = np.ones(n, dtype=bool)
+    diverged = np.zeros(n, dtype=bool)
+    success: NDArray[np.bool_] | None = None
+    while running.any() and (max_steps is None or len(actions) < max_steps):
+        action = np.asarray(policy.act(seen))
+        observation, _, terminated, truncated, info = env.step(action)
+        measured = measure(np.array(observation, dtype=np.float64))
+        observations.append(np.where(running[:, None], measured, np.nan))
+        actions.append(np.where(running[:, None], action, np.nan))
+        seen = np.where(np.isnan(measured), seen, measured)
+        lengths += running
+        diverged |= running & np.asarray(info.get("diverged", False), dtype=bool)
+        if "is_success" in info:
+            success = np.zeros(n, dtype=bool) if success is None else success
+            success = np.where(running, np.asarray(info["is_success"], dtype=bool), success)
+        running &= ~(terminated | truncated)
+    return Rollouts(np.stack(observations, 1), np.stack(actions, 1), lengths, diverged, success)

@@ -1,0 +1,169 @@
+"""The loop on a toy: it finds what is hidden, leaves alone what is right, and says when no ξ will do."""
+
+import json
+from functools import partial
+
+import numpy as np
+import pytest
+from toy_reach import SPACE, LeanTrainer, PushPolicy, ReachEnv
+
+from simopt_envs.adaptation import Discrepancy, EnvSimulator, HiddenSystem, SimOpt
+from simopt_envs.distributions import Gaussian
+
+XI = SPACE.subset(["gain", "force"])
+START = Gaussian.around_nominal(XI, std=[0.2, 0.2])
+
+
+def make(target=None, seed=0, **changes):
+    system = changes.pop("real_system", None) or HiddenSystem("Toy/Reach-v0", target or {}, noise=0.002, dropout=0.05)
+    arguments = {"trainer": LeanTrainer(), "simulated_rollouts": 300, "evaluation_episodes": 20} | changes
+    return SimOpt("Toy/Reach-v0", START, real_system=system, seed=seed, **arguments)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_finds_what_is_hidden(seed):
+    """Three initial standard deviations away in one parameter, 1.3 in the other."""
+    first, *_, last = make({"force": 0.6, "gain": 1.3}, seed).run(3)
+    assert first.target_success == 0.0
+    assert first.distribution is START
+    assert (first.kl, first.effective_sample_size) == (0.0, None)
+    assert last.target_success == 1.0
+    np.testing.assert_allclose(last.distribution.median, [1.3, 0.6], atol=0.03)
+    assert last.verdict.label != "unexplained"
+    assert last.discrepancy_mean < 0.1 * first.discrepancy_mean
+    assert last.policy.trainings == 4
+    assert 0 < last.kl <= 1 + 1e-6
+    assert 1 < last.effective_sample_size < 100
+    assert (last.real_rollouts, last.sim_rollouts, last.train_steps) == (3, 900, 40 * 64)
+    assert last.best_xi["force"] == pytest.approx(0.6, abs=0.05)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_leaves_alone_what_is_right(seed):
+    first, *_, last = make({}, seed).run(2)
+    assert first.target_success == last.target_success == 1.0
+    assert first.verdict.label == "explained"
+    assert (np.abs(last.distribution.mean - START.mean) < 0.5 * START.std).all()
+
+
+def test_says_when_no_parameter_explains_it():
+    shaken = HiddenSystem(partial(ReachEnv, disturbance=4.0), {}, noise=0.002)
+    *_, last = make(real_system=shaken).run(3)
+    assert last.verdict.label == "unexplained"
+    assert last.verdict.best > 3 * last.verdict.threshold
+
+
+def test_says_when_the_measurements_tell_nothing():
+    blind = HiddenSystem("Toy/Reach-v0", {}, noise=5.0)
+    [first] = make(real_system=blind).run(0)
+    assert first.verdict.label == "uninformative"
+
+
+def test_runs_repeat_and_seeds_differ():
+    target = {"force": 0.4}
+    *_, a = make(target, 3).run(1)
+    *_, b = make(target, 3).run(1)
+    *_, c = make(target, 4).run(1)
+    np.testing.assert_array_equal(a.distribution.mean, b.distribution.mean)
+    np.testing.assert_array_equal(a.costs, b.costs)
+    assert (a.distribution.mean != c.distribution.mean).all()
+
+
+def test_a_foreign_environment_and_robot():
+    """Single environments in Gymnasium's own vector environment, and a robot that only rolls out."""
+
+    class Robot:
+        def rollout(self, policy, n, rng):
+            return HiddenSystem(ReachEnv, {"force": 0.6}).rollout(policy, n, rng)
+
+    loop = SimOpt(EnvSimulator(ReachEnv), START, LeanTrainer(), Robot(), simulated_rollouts=90)
+    first, *_, last = loop.run(2)
+    assert loop.discrepancy.weights == (1.0, 0.5)
+    assert (first.target_success, last.target_success) == (0.0, 1.0)
+
+
+def test_a_fixed_policy_is_kept():
+    policy = PushPolicy(lean=-0.3)
+    *_, last = make({"force": 0.4}, trainer=None, policy=policy).run(2)
+    assert last.policy is policy
+    assert last.train_steps == 0
+    assert last.distribution.median[1] == pytest.approx(0.4, abs=0.03)
+
+
+def test_diverged_simulations_do_not_count():
+    import gymnasium as gym
+    from toy_reach import ReachVectorEnv
+
+    for limit, identifier in ((1.4, "Toy/Explodes-v0"), (0.0, "Toy/AlwaysExplodes-v0")):
+        if identifier not in gym.registry:
+            gym.register(
+                identifier, entry_point=ReachEnv, vector_entry_point=partial(ReachVectorEnv, explode_above=limit)
+            )
+    system = HiddenSystem("Toy/Reach-v0", {"force": 0.4, "gain": 1.2})
+    *_, last = SimOpt("Toy/Explodes-v0", START, LeanTrainer(), system, simulated_rollouts=300).run(1)
+    np.testing.assert_allclose(last.distribution.median, [1.2, 0.4], atol=0.1)
+    assert np.isinf(last.costs).sum() == (last.xi[:, 0] > 1.4).sum()
+    with pytest.raises(RuntimeError, match="diverged for every one"):
+        list(SimOpt("Toy/AlwaysExplodes-v0", START, LeanTrainer(), system).run(1))
+
+
+def test_result_file(tmp_path):
+    records = list(make({"force": 0.4}, 5, directory=tmp_path / "out").run(1))
+    result = json.loads((tmp_path / "out/result.json").read_text())
+    assert result["env_id"] == "Toy/Reach-v0"
+    assert result["seed"] == 5
+    assert result["parameter_names"] == ["gain", "force"]
+    assert result["coordinates"] == ["log", "linear"]
+    assert [entry["index"] for entry in result["iterations"]] == [0, 1]
+    for entry, record in zip(result["iterations"], records, strict=True):
+        assert entry == json.loads(json.dumps(record.to_dict()))
+        assert entry["mean"] == record.distribution.mean.tolist()
+        assert np.shape(entry["covariance"]) == (2, 2)
+        np.testing.assert_allclose(entry["std"], np.sqrt(np.diag(entry["covariance"])))
+        assert entry["discrepancy"]["min"] <= entry["discrepancy"]["mean"]
+        contract = "kl effective_sample_size target_success sim_success train_seconds train_steps sim_rollouts"
+        assert set(contract.split()) | {"real_rollouts"} <= entry.keys()
+
+
+class Forgetful:
+    def __call__(self, make_vector_env, policy, rng):
+        raise AssertionError("no work may have begun")
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"real_rollouts": 0}, ValueError, "real_rollouts must be at least 1, got 0"),
+        ({"simulated_rollouts": 5}, ValueError, "simulated_rollouts must be at least 6"),
+        ({"updates_per_iteration": 0}, ValueError, "updates_per_iteration"),
+        ({"discrepancy": Discrepancy([1.0, 1.0, 1.0])}, ValueError, "one per observed channel, 2"),
+        ({"trainer": None}, ValueError, "give a trainer or a policy"),
+        ({"trainer": Forgetful(), "directory": "out"}, TypeError, "Forgetful has no save and load"),
+    ],
+)
+def test_bad_arguments(changes, error, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(error, match=message):
+        make(**changes)
+    assert not list(tmp_path.iterdir())
+
+
+def test_unknown_parameters():
+    from simopt_envs.physics import Parameter, ParameterSpace
+
+    other = ParameterSpace([Parameter("forces", "N", 0.0, -1.0, 1.0, coordinate="linear")])
+    with pytest.raises(ValueError, match="unknown parameter 'forces'; did you mean 'force'"):
+        SimOpt("Toy/Reach-v0", Gaussian.around_nominal(other, 0.1), Forgetful(), HiddenSystem(ReachEnv, {}))
+    with pytest.raises(ValueError, match="iterations must be >= 0"):
+        make().run(-1)
+
+
+def test_a_robot_of_other_channels():
+    class Robot:
+        def rollout(self, policy, n, rng):
+            from simopt_envs.measured.trajectory import Trajectory
+
+            return [Trajectory(np.zeros((4, 3)), np.zeros((3, 1)))]
+
+    with pytest.raises(ValueError, match="3 observed channels, the simulator 2"):
+        list(make(real_system=Robot()).run(0))
