@@ -53,17 +53,17 @@ class PPOConfig:
         ValueError: A count that is not positive, or as many evaluation worlds as worlds.
     """
 
-    num_envs: int = 128
+    num_envs: int = 32
     """Worlds stepped side by side."""
     num_steps: int = 50
     """Control steps of every world in one iteration; whole episodes, where all worlds end theirs together."""
-    iterations: int = 62
+    iterations: int = 250
     """Iterations (rollout and update) of a training from scratch."""
-    warm_start_iterations: int = 25
+    warm_start_iterations: int = 80
     """Iterations of a training that continues from a given policy."""
     epochs: int = 10
     """Passes over the batch in one update."""
-    minibatches: int = 5
+    minibatches: int = 3
     """Gradient steps in one pass."""
     gamma: float = 0.98
     """Discount factor."""
@@ -83,7 +83,7 @@ class PPOConfig:
     """Gradients are scaled down to this norm."""
     hidden: int = 64
     """Width of the two hidden layers of the actor, and of those of the critic."""
-    initial_log_std: float = -0.7
+    initial_log_std: float = -0.3
     """Logarithm of the exploration noise at the start, where the action range is ±1."""
     success_stop: float | None = None
     """Training ends early at this success rate (mean of `info["is_success"]` at episode ends)."""
@@ -206,7 +206,8 @@ class TorchPolicy(nn.Module):
     @torch.inference_mode()
     def act(self, observations: NDArray[np.floating]) -> NDArray[np.float32]:
         """The mean action of each observation: (n, observation_size) -> (n, action_size), within the bounds."""
-        return self.to_env(self.actor(self.observation_normaliser(_tensor(observations))))
+        with one_torch_thread():  # more of them only wait for the simulation's
+            return self.to_env(self.actor(self.observation_normaliser(_tensor(observations))))
 
     def to_env(self, actions: Tensor) -> NDArray[np.float32]:
         """Normalised actions in the units of the action space, clipped into it."""

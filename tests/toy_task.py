@@ -45,6 +45,7 @@ class ToyTask:
     action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
     substeps = 3
     camera = "side"
+    observation_names = ("position",)
     discrepancy_weights = np.ones(1)
 
     def make_model(self, visual=True):

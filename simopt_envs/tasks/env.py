@@ -38,6 +38,7 @@ class TaskEnv(gym.Env[Array, Array]):
         self.simulation = SingleSimulation(task.make_model(), task.parameters)
         self.parameters: ParameterSpace = task.parameters
         self.observation_space, self.action_space = task.observation_space, task.action_space
+        self.observation_names = task.observation_names
         self.discrepancy_weights = task.discrepancy_weights
         self.metadata = self.metadata | {"render_fps": round(1 / self.dt)}
         self.render_mode = render_mode

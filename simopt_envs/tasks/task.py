@@ -40,6 +40,7 @@ class Task(Protocol):
         observation_space, action_space: of one world.
         substeps: model steps per control step.
         camera: name of the camera that shows the scene.
+        observation_names: (o,), what the observed channels are.
         discrepancy_weights: (o,), the weight of each observed channel in the discrepancy (W in the paper's Eq. 4).
     """
 
@@ -48,6 +49,7 @@ class Task(Protocol):
     action_space: spaces.Box[Any]
     substeps: int
     camera: str
+    observation_names: tuple[str, ...]
     discrepancy_weights: Array
 
     def make_model(self, visual: bool = True) -> mujoco.MjModel:

@@ -1,0 +1,95 @@
+"""Which number of a MuJoCo simulation a column of a recording stands for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import mujoco
+import numpy as np
+
+from simopt_envs.measured.resample import Array
+
+Kind = Literal["ctrl", "qpos", "qvel", "sensordata", "site_xpos"]
+
+
+@dataclass(frozen=True)
+class Channel:
+    """A column's place in a simulation.
+
+    Attributes:
+        name: the column, ``"qpos/elbow"``.
+        kind: the ``MjData`` field.
+        index: position in that field, flattened for one world.
+        object: id of the actuator, joint, sensor or site.
+        unit: of its values, ``""`` where it is not known.
+    """
+
+    name: str
+    kind: Kind
+    index: int
+    object: int
+    unit: str
+
+
+_SENSOR_UNITS = {
+    mujoco.mjtSensor.mjSENS_JOINTVEL: "rad/s",
+    mujoco.mjtSensor.mjSENS_GYRO: "rad/s",
+    mujoco.mjtSensor.mjSENS_VELOCIMETER: "m/s",
+    mujoco.mjtSensor.mjSENS_FRAMELINVEL: "m/s",
+    mujoco.mjtSensor.mjSENS_FRAMEPOS: "m",
+    mujoco.mjtSensor.mjSENS_ACCELEROMETER: "m/s^2",
+    mujoco.mjtSensor.mjSENS_FORCE: "N",
+    mujoco.mjtSensor.mjSENS_TORQUE: "N m",
+}
+
+
+def model_channels(model: mujoco.MjModel) -> dict[str, Channel]:
+    """Every column a recording of this model can have, by name; unnamed objects have none.
+
+    Where a joint has several numbers (ball, free) they are ``/0``, ``/1`` ..., as for sensors.
+    """
+    channels: list[Channel] = []
+
+    def add(prefix: str, kind: Kind, object_id: int, start: int, count: int, units: tuple[str, ...]) -> None:
+        for k in range(count):
+            name = prefix if count == 1 else f"{prefix}/{k}"
+            channels.append(Channel(name, kind, start + k, object_id, units[min(k, len(units) - 1)]))
+
+    for i in range(model.nu):
+        if name := model.actuator(i).name:
+            add(f"ctrl/{name}", "ctrl", i, i, 1, ("",))
+    for i in range(model.njnt):
+        if name := model.joint(i).name:
+            joint = mujoco.mjtJoint(model.jnt_type[i])
+            positions, velocities, unit, rate = {
+                mujoco.mjtJoint.mjJNT_FREE: (7, 6, ("m", "m", "m", "1"), ("m/s", "m/s", "m/s", "rad/s")),
+                mujoco.mjtJoint.mjJNT_BALL: (4, 3, ("1",), ("rad/s",)),
+                mujoco.mjtJoint.mjJNT_SLIDE: (1, 1, ("m",), ("m/s",)),
+                mujoco.mjtJoint.mjJNT_HINGE: (1, 1, ("rad",), ("rad/s",)),
+            }[joint]
+            add(f"qpos/{name}", "qpos", i, int(model.jnt_qposadr[i]), positions, unit)
+            add(f"qvel/{name}", "qvel", i, int(model.jnt_dofadr[i]), velocities, rate)
+    for i in range(model.nsensor):
+        if name := model.sensor(i).name:
+            sensor = mujoco.mjtSensor(model.sensor_type[i])
+            unit_of_sensor = _SENSOR_UNITS.get(sensor, "")
+            add(
+                f"sensor/{name}", "sensordata", i, int(model.sensor_adr[i]), int(model.sensor_dim[i]), (unit_of_sensor,)
+            )
+    for i in range(model.nsite):
+        if name := model.site(i).name:
+            for k, axis in enumerate("xyz"):
+                channels.append(Channel(f"site/{name}/{axis}", "site_xpos", 3 * i + k, i, "m"))
+    return {channel.name: channel for channel in channels}
+
+
+def read_channels(channels: list[Channel], fields: dict[str, np.ndarray]) -> Array:
+    """The channels' values, (..., c), from fields of shape (..., n) or, for sites, (..., nsite, 3)."""
+    columns = []
+    for channel in channels:
+        values = fields[channel.kind]
+        if channel.kind == "site_xpos":
+            values = values.reshape(*values.shape[:-2], -1)
+        columns.append(values[..., channel.index])
+    return np.stack(columns, axis=-1)

@@ -1,0 +1,245 @@
+"""Stretches of recordings that a model can be run through, and running it: for every window and every ξ at once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from simopt_envs.measured.channels import Channel, model_channels
+from simopt_envs.measured.engines import BatchEngine, RolloutEngine, field_sizes
+from simopt_envs.measured.recording import Recording
+from simopt_envs.measured.resample import GAP_PERIODS, Array, hold, longest_interval
+from simopt_envs.measured.states import States, estimate_states
+from simopt_envs.physics.parameters import ParameterSpace
+
+_NUMBERS_AT_ONCE = 2**25  # a chunk of worlds records at most so many, 256 MB
+
+
+@dataclass(frozen=True)
+class Windows:
+    """w stretches of equal length from one or several recordings.
+
+    Attributes:
+        channels: the c columns that are compared.
+        offsets: seconds from a window's start to its samples, (S,), offsets[0] = 0.
+        start_time: when each window begins in its recording [s], (w,).
+        recording: name of the recording each comes from, w of them.
+        measured: (w, S, c), NaN where a sample is missing.
+        commands: held over each step of the model, (w, N, nu), N = (S - 1) * stride.
+        past_commands: those of the steps before the start, oldest first, (w, P, nu): a delayed actuator still sees
+            them.
+        starts: the estimated states at the start.
+        stride: steps of the model from one sample to the next.
+    """
+
+    channels: tuple[Channel, ...]
+    offsets: Array
+    start_time: Array
+    recording: tuple[str, ...]
+    measured: Array
+    commands: Array
+    past_commands: Array
+    starts: States
+    stride: int
+
+    def __len__(self) -> int:
+        return len(self.start_time)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the compared columns."""
+        return tuple(channel.name for channel in self.channels)
+
+    def channel_scale(self) -> Array:
+        """Standard deviation of each channel over all windows, (c,): what normalised errors are relative to."""
+        return np.nanstd(self.measured.reshape(-1, len(self.channels)), axis=0)
+
+
+def cut_windows(
+    model: mujoco.MjModel,
+    recordings: Recording | Sequence[Recording],
+    seconds: float | None = None,
+    step: float | None = None,
+    keyframe: str | None = None,
+) -> Windows:
+    """Cut recordings into windows with estimated starts.
+
+    Samples are compared at the multiple of the model's timestep nearest to the recording's period; commands are held
+    on the timestep itself.
+
+    Args:
+        model: names the columns and gives the timestep.
+        recordings: with all columns they can be compared in; all must have the same ones.
+        seconds: length of a window; None for one window per recording, of its whole length (or of the shortest one's).
+        step: seconds between starts; the length by default, so that windows do not overlap.
+        keyframe: where joints without a column start, see :func:`estimate_states`.
+
+    Raises:
+        ValueError: if an actuator has no column, no column names anything in the model, recordings differ in their
+            columns, or no whole window fits.
+    """
+    recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    if not recordings:
+        raise ValueError("windows need at least one recording")
+    known = model_channels(model)
+    for recording in recordings:
+        _check_columns(model, recording, recordings[0], known)
+    channels = tuple(known[name] for name in recordings[0].signals if name in known)
+    timestep = float(model.opt.timestep)
+    stride = max(1, round(max(recording.period for recording in recordings) / timestep))
+    period = stride * timestep
+    grids = [recording.resample(period) for recording in recordings]
+    samples = min(len(grid) for grid in grids) if seconds is None else round(seconds / period) + 1
+    hop = samples if seconds is None else max(1, round((step or seconds) / period))
+    past = _longest_history(model)
+    parts = []
+    for recording, grid in zip(recordings, grids, strict=True):
+        starts = np.arange(0, len(grid) - samples + 1, hop)[: 1 if seconds is None else None]
+        starts = starts[[_is_usable(recording.in_order(), grid, s, s + samples - 1) for s in starts]]
+        if not len(starts):
+            continue
+        measured = np.stack([grid[c.name] for c in channels], axis=-1)
+        commands = _commands(model, recording.in_order(), grid.time[starts], timestep, past, stride * (samples - 1))
+        parts.append(
+            Windows(
+                channels=channels,
+                offsets=np.arange(samples) * np.float64(period),
+                start_time=grid.time[starts],
+                recording=(recording.name,) * len(starts),
+                measured=measured[starts[:, None] + np.arange(samples)],
+                commands=commands[:, past:],
+                past_commands=commands[:, :past],
+                starts=estimate_states(model, grid, starts, keyframe),
+                stride=stride,
+            )
+        )
+    if not parts:
+        wanted = "" if seconds is None else f" of {seconds:g} s"
+        longest = max(recording.duration for recording in recordings)
+        raise ValueError(f"no whole window{wanted} without gaps in any recording; the longest lasts {longest:g} s")
+    return _join(parts)
+
+
+class WindowSimulator:
+    """Runs a model through windows, for many ξ at once.
+
+    The simulated worlds are kept between calls, so a fit that calls again and again pays for them once.
+
+    Args:
+        model: the model; it is not changed.
+        windows: what to run it through.
+        space: the parameters that differ between ξ; None for the model as it is.
+        num_threads: 0 for one per core.
+    """
+
+    def __init__(
+        self, model: mujoco.MjModel, windows: Windows, space: ParameterSpace | None = None, num_threads: int = 0
+    ):
+        self.windows = windows
+        self.space = space if space is not None else ParameterSpace(())
+        numbers_per_window = (windows.commands.shape[1] + 1) * sum(field_sizes(model, windows.channels).values())
+        self._xi_at_once = max(1, _NUMBERS_AT_ONCE // (numbers_per_window * len(windows)))
+        self._engine: BatchEngine | RolloutEngine
+        try:
+            import mujoco.batch  # noqa: F401
+        except ImportError:
+            self._engine = RolloutEngine(model, self.space, windows, num_threads)
+        else:
+            self._engine = BatchEngine(model, self.space, windows, num_threads)
+
+    def __call__(self, xi: ArrayLike | None = None, starts: States | None = None) -> Array:
+        """Simulate the windows.
+
+        Args:
+            xi: (n, d); None for the model as it is, n = 1.
+            starts: w states other than the windows' own.
+
+        Returns:
+            (n, w, S, c), NaN from where a simulation diverged.
+
+        Raises:
+            ValueError: for values that the space does not allow.
+        """
+        values = self.space.validate(np.atleast_2d(self.space.nominal if xi is None else np.asarray(xi)))
+        starts = self.windows.starts if starts is None else starts
+        chunks = [values[i : i + self._xi_at_once] for i in range(0, len(values), self._xi_at_once)]
+        return np.concatenate([self._engine.run(chunk, starts) for chunk in chunks])
+
+
+def simulate_windows(
+    model: mujoco.MjModel, windows: Windows, space: ParameterSpace | None = None, xi: ArrayLike | None = None
+) -> Array:
+    """Predicted channels (n, w, S, c) for n vectors ξ (n, d); see :class:`WindowSimulator` to call repeatedly."""
+    return WindowSimulator(model, windows, space)(xi)
+
+
+def _longest_history(model: mujoco.MjModel) -> int:
+    """Past commands that the start of a window needs, at least the one in force."""
+    return max(1, int(np.max(np.ravel(model.actuator_history[:, 0]), initial=0)) if model.nhistory else 1)
+
+
+def _commands(
+    model: mujoco.MjModel, recording: Recording, starts: Array, timestep: float, past: int, future: int
+) -> Array:
+    """Commands (w, past + future, nu) on the model's timestep around each start."""
+    at = starts[:, None] + timestep * np.arange(-past, future)
+    columns = [hold(recording.time, recording[f"ctrl/{model.actuator(i).name}"], at) for i in range(model.nu)]
+    return np.stack(columns, axis=-1) if columns else np.empty((*at.shape, 0))
+
+
+def _is_usable(recording: Recording, grid: Recording, start: int, end: int) -> bool:
+    """Whether a window holds no gap in time and no missing joint position at its start."""
+    interval = longest_interval(recording.time, grid.time[start], min(grid.time[end], recording.time[-1]))
+    continuous = interval <= GAP_PERIODS * recording.period
+    known = all(np.isfinite(grid[name][start]) for name in grid.signals if name.startswith("qpos/"))
+    return continuous and known
+
+
+def _check_columns(model: mujoco.MjModel, recording: Recording, first: Recording, known: dict[str, Channel]) -> None:
+    """Raise ValueError where a recording cannot be replayed."""
+    if missing := [
+        model.actuator(i).name for i in range(model.nu) if f"ctrl/{model.actuator(i).name}" not in recording.columns
+    ]:
+        raise ValueError(
+            f"{recording.name} has no command column for the actuators {', '.join(missing)}; it has"
+            f" {', '.join(recording.commands) or 'none'}"
+        )
+    for name in recording.commands:
+        if name in known and not np.isfinite(recording[name]).all():
+            raise ValueError(f"{recording.name}: command {name} has values that are not finite")
+    compared = [name for name in recording.signals if name in known]
+    if not compared:
+        raise ValueError(
+            f"no column of {recording.name} names anything in the model: it has {', '.join(recording.columns)}; the"
+            f" model has {', '.join(known)}"
+        )
+    if compared != [name for name in first.signals if name in known]:
+        raise ValueError(f"{recording.name} and {first.name} are compared in different columns; select common ones")
+
+
+def _join(parts: list[Windows]) -> Windows:
+    """Windows of several recordings as one set."""
+    first = parts[0]
+
+    def rows(attribute: str) -> NDArray[np.float64]:
+        return np.concatenate([getattr(part, attribute) for part in parts])
+
+    states = [
+        np.concatenate([getattr(part.starts, name) for part in parts])
+        for name in ("qpos", "qvel", "qpos_error", "qvel_error")
+    ]
+    return Windows(
+        channels=first.channels,
+        offsets=first.offsets,
+        start_time=rows("start_time"),
+        recording=tuple(name for part in parts for name in part.recording),
+        measured=rows("measured"),
+        commands=rows("commands"),
+        past_commands=rows("past_commands"),
+        starts=States(*states),
+        stride=first.stride,
+    )

@@ -1,0 +1,379 @@
+"""Recordings: files read and written, foreign logs mapped, time stamps made uniform."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.io import savemat
+
+from simopt_envs.measured import LogMapping, Recording, Source, load_recording, load_recordings
+from simopt_envs.measured.resample import band_limited, hold, resolution, smooth
+
+EXAMPLES = Path(__file__).parents[1] / "simopt_envs" / "measured" / "examples"
+
+
+needs_yaml = pytest.mark.skipif(importlib.util.find_spec("yaml") is None, reason="needs pyyaml")
+parquet_format = pytest.param(
+    ".parquet", marks=pytest.mark.skipif(importlib.util.find_spec("pyarrow") is None, reason="needs pyarrow")
+)
+
+
+def sine(rate: float = 100.0, seconds: float = 4.0, frequency: float = 1.0) -> Recording:
+    time = np.arange(round(rate * seconds)) / rate
+    phase = 2 * np.pi * frequency * time
+    return Recording(
+        time,
+        {"ctrl/motor": np.sign(np.sin(phase)), "qpos/hinge": np.sin(phase), "sensor/imu/0": np.cos(phase)},
+        name="sine",
+    )
+
+
+def test_columns_must_be_as_long_as_time():
+    with pytest.raises(ValueError, match=r"'qpos/a' has shape \(2,\), time has \(3,\)"):
+        Recording(np.arange(3.0), {"qpos/a": np.zeros(2)})
+    with pytest.raises(ValueError, match=r"unknown column 'qpos/hing'; did you mean 'qpos/hinge'\?"):
+        sine()["qpos/hing"]
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".npz", parquet_format])
+def test_every_format_keeps_every_bit(tmp_path, suffix):
+    recording = sine()
+    recording["qpos/hinge"][7] = np.nan
+    again = load_recording(recording.save(tmp_path / f"log{suffix}"))
+    assert again.name == "log"
+    assert list(again.columns) == list(recording.columns)
+    np.testing.assert_array_equal(again.time, recording.time)
+    for name in recording.columns:
+        np.testing.assert_array_equal(again[name], recording[name])
+
+
+def test_an_unknown_suffix_is_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"one of \.csv, \.parquet, \.npz, got 'log\.xls'"):
+        sine().save(tmp_path / "log.xls")
+    (tmp_path / "log.xls").write_text("x")
+    with pytest.raises(ValueError, match="unknown kind of recording; known are"):
+        load_recording(tmp_path / "log.xls")
+    with pytest.raises(FileNotFoundError, match=r"no recording .*missing\.csv"):
+        load_recording(tmp_path / "missing.csv")
+
+
+def test_commands_are_held_and_signals_interpolated():
+    recording = sine(rate=100)
+    fine = recording.resample(0.002)
+    np.testing.assert_array_equal(fine["ctrl/motor"], np.repeat(recording["ctrl/motor"], 5)[: len(fine)])
+    truth = np.sin(2 * np.pi * fine.time)
+    assert np.abs(fine["qpos/hinge"] - truth).max() < 2e-5
+    assert np.abs(np.interp(fine.time, recording.time, recording["qpos/hinge"]) - truth).max() > 2e-4  # a line would
+
+
+def test_resampling_does_not_fold_frequencies_back():
+    """45 Hz sampled at 20 Hz would appear as 5 Hz; 1 Hz must come through unchanged and undelayed."""
+    time = np.arange(4000) / 1000
+    slow, fast = np.sin(2 * np.pi * time), np.sin(2 * np.pi * 45 * time)
+    coarse = Recording(time, {"qpos/a": slow + fast, "ctrl/a": slow + fast}).resample(0.05)
+    inside = (coarse.time > 0.5) & (coarse.time < 3.5)
+    truth = np.sin(2 * np.pi * coarse.time[inside])
+    assert np.abs(coarse["qpos/a"][inside] - truth).max() < 0.01
+    assert np.abs(coarse["ctrl/a"][inside] - truth).max() > 0.5, "plain sampling, for contrast, does fold back"
+
+
+def test_jittered_stamps_are_made_uniform():
+    rng = np.random.default_rng(0)
+    time = np.cumsum(rng.uniform(0.0005, 0.0035, 2000))
+    uniform = Recording(time, {"qpos/a": np.sin(2 * np.pi * time)}).resample(0.002)
+    np.testing.assert_allclose(np.diff(uniform.time), 0.002, rtol=1e-9)
+    # As if the samples were equally far apart, the error would be that of a wandering clock.
+    assert np.abs(uniform["qpos/a"] - np.sin(2 * np.pi * uniform.time)).max() < 1e-5
+
+
+def test_signals_are_missing_inside_a_gap_and_beyond_the_ends():
+    time = np.delete(np.arange(1000) / 1000, np.s_[400:450])
+    grid = np.arange(1000) / 1000
+    filled = band_limited(time, np.sin(time), grid)
+    assert np.isnan(filled[401:449]).all()
+    assert np.isfinite(np.delete(filled, np.s_[400:450])).all()
+    assert np.isnan(band_limited(time, np.sin(time), np.array([-0.1, 0.5, 1.2]))[[0, 2]]).all()
+    assert np.isfinite(
+        band_limited(np.delete(time, np.s_[100:102]), np.sin(np.delete(time, np.s_[100:102])), grid)[:400]
+    ).all()
+
+
+def test_hold_before_the_first_stamp_and_within_rounding_of_a_stamp():
+    time, values = np.array([0.1, 0.2, 0.3]), np.array([1.0, 2.0, 3.0])
+    np.testing.assert_array_equal(hold(time, values, np.array([0.0, 0.1, 0.2 - 1e-9, 0.19, 0.9])), [1, 1, 2, 1, 3])
+
+
+def test_time_that_repeats_is_thinned_and_time_that_runs_backward_refused():
+    repeated = Recording(np.array([0.0, 0.1, 0.1, 0.2]), {"qpos/a": np.array([0.0, 1.0, 2.0, 3.0])})
+    np.testing.assert_array_equal(repeated.in_order()["qpos/a"], [0, 2, 3])
+    with pytest.raises(ValueError, match="never run backward"):
+        Recording(np.array([0.0, 0.2, 0.1]), {}).resample(0.1)
+
+
+def test_select_split_and_windows():
+    recording = sine(rate=100, seconds=10)
+    part = recording.select(2.0, 3.0)
+    assert (part.time[0], len(part)) == (2.0, 100)
+    with pytest.raises(ValueError, match=r"no sample in \[20, inf\) s; it spans 0 to 9.99 s"):
+        recording.select(start=20)
+    fitted, held_out = recording.split(0.6, guard=0.5)
+    assert fitted.time[-1] < 6.0
+    assert held_out.time[0] - fitted.time[-1] >= 0.5
+    with pytest.raises(ValueError, match="0 < fraction < 1"):
+        recording.split(1.0)
+    windows = list(recording.windows(1.0, step=2.0))
+    assert [w.time[0] for w in windows] == [0, 2, 4, 6, 8]
+    assert all(len(w) == 101 for w in windows)
+    holed = Recording(np.delete(recording.time, np.s_[450:470]), {"qpos/a": np.zeros(980)})
+    assert [round(w.time[0], 2) for w in holed.windows(1.0)] == [0, 1, 2, 3, 5, 6, 7, 8]
+
+
+def test_smoothing_finds_velocity_and_how_wrong_it_may_be():
+    rng = np.random.default_rng(1)
+    time = np.arange(3000) / 500
+    position, velocity = np.sin(4 * time), 4 * np.cos(4 * time)
+    smoothed = smooth(position + rng.normal(0, 1e-3, 3000), 1 / 500)
+    assert smoothed.noise == pytest.approx(1e-3, rel=0.1)
+    inside = slice(100, -100)
+    error = np.std(smoothed.velocity[inside] - velocity[inside])
+    assert error < np.std(np.gradient(position + rng.normal(0, 1e-3, 3000), 1 / 500) - velocity) / 20
+    assert 0.7 < error / smoothed.velocity_error < 1.5
+    assert 0.7 < np.std(smoothed.value[inside] - position[inside]) / smoothed.value_error < 1.5
+
+
+def test_smoothing_sees_across_the_counts_of_an_encoder():
+    time = np.arange(5000) / 1000
+    count = 2 * np.pi / 4000
+    rounded = np.round(0.3 * np.sin(time) / count) * count
+    assert resolution(rounded) == pytest.approx(count)
+    smoothed = smooth(rounded, 1e-3)
+    assert smoothed.noise == pytest.approx(count / np.sqrt(12), rel=0.15)
+    assert np.std(smoothed.velocity - 0.3 * np.cos(time)) < 0.02  # a difference quotient: 0.7
+
+
+def test_smoothing_leaves_missing_samples_missing():
+    values = np.sin(np.arange(200) / 20)
+    values[50:55] = np.nan
+    smoothed = smooth(values, 0.05)
+    np.testing.assert_array_equal(np.isnan(smoothed.velocity), np.isnan(values))
+    with pytest.raises(ValueError, match="at least 5 samples, got 3"):
+        smooth(np.zeros(3), 0.1)
+
+
+# --- mappings -------------------------------------------------------------------------------------------------------
+
+
+def mapping_file(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "mapping.yaml"
+    path.write_text(text)
+    return path
+
+
+@needs_yaml
+def test_a_mapping_renames_scales_shifts_and_converts(tmp_path):
+    mapping = mapping_file(
+        tmp_path,
+        """
+        time: {from: stamp, unit: ms}
+        columns:
+          ctrl/drive: {from: vir, scale: 35.1507}
+          qpos/hinge: {from: angle, unit: deg, offset: 0.5}
+          qpos/slide: {from: x, unit: mm, scale: -1}
+          sensor/plain: raw
+        """,
+    )
+    (tmp_path / "log.csv").write_text("stamp,vir,angle,x,raw,other\n0,1,180,100,7,9\n2,2,90,200,8,9\n")
+    recording = load_recording(tmp_path / "log.csv", mapping)
+    np.testing.assert_allclose(recording.time, [0, 0.002])
+    np.testing.assert_allclose(recording["ctrl/drive"], [35.1507, 70.3014])
+    np.testing.assert_allclose(recording["qpos/hinge"], [np.pi + 0.5, np.pi / 2 + 0.5])
+    np.testing.assert_allclose(recording["qpos/slide"], [-0.1, -0.2])
+    assert set(recording.columns) == {"ctrl/drive", "qpos/hinge", "qpos/slide", "sensor/plain"}
+
+
+@needs_yaml
+def test_text_without_names_or_stamps(tmp_path):
+    (tmp_path / "log.txt").write_text("made by: a rig\nrate, 200\n  10 1\n 20 2\n 30 3\n 40 4\n")
+    mapping = mapping_file(
+        tmp_path,
+        "header_lines: 2\ncolumn_names: [angle, volt]\nsample_rate: 200\nstart: 0.005\nend: 0.015\n"
+        "columns: {qpos/a: {from: angle, unit: deg}}",
+    )
+    recording = load_recording(tmp_path / "log.txt", mapping)
+    np.testing.assert_allclose(recording.time, [0.005, 0.010])
+    np.testing.assert_allclose(recording["qpos/a"], np.deg2rad([20, 30]))
+    with pytest.raises(ValueError, match="no line of column names; give column_names"):
+        load_recording(tmp_path / "log.txt", LogMapping({"qpos/a": Source("angle")}, header_lines=2))
+
+
+@needs_yaml
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("columns: {qpos/a: {from: x, unit: degree}}", "unknown unit of 'x': 'degree'; did you mean 'deg'"),
+        ("columns: {qpos/a: {form: x}}", r"expected a name or \{from: name"),
+        ("columns: {qpos/a: {from: x, sacle: 2}}", "unknown key of column 'qpos/a': 'sacle'; did you mean 'scale'"),
+        ("columns: {qpos/a: {from: x, scale: two}}", "scale of 'qpos/a' must be a number, got 'two'"),
+        ("columns: {qpos/a: {from: x, scale: 0}}", "scale not 0"),
+        ("columns: {qpos/a: x}\nsamplerate: 3", "unknown key 'samplerate'; did you mean 'sample_rate'"),
+        ("columns: {qpos/a: x}\nsample_rate: -3", "must be positive, got -3 Hz"),
+        ("columns: {}", "at least one column"),
+        ("rows: []", "has a key 'columns'"),
+        ("columns: [", "is not YAML"),
+        ("columns: {qpos/a: angel}", "unknown column of the log 'angel'; did you mean 'angle'"),
+    ],
+)
+def test_a_wrong_mapping_says_what_is_wrong(tmp_path, text, message):
+    (tmp_path / "log.csv").write_text("time,angle\n0,1\n1,2\n")
+    with pytest.raises(ValueError, match=message):
+        load_recording(tmp_path / "log.csv", mapping_file(tmp_path, text))
+
+
+def test_the_stamps_must_agree_with_a_declared_rate(tmp_path):
+    path = sine(rate=100).save(tmp_path / "log.csv")
+    columns = {"qpos/hinge": Source("qpos/hinge")}
+    assert len(load_recording(path, LogMapping(columns, sample_rate=100.0))) == 400
+    with pytest.raises(
+        ValueError, match=r"wrong rate: the median interval .* is 0\.01 s, the mapping declares 1000 Hz"
+    ):
+        load_recording(path, LogMapping(columns, sample_rate=1000.0))
+
+
+# --- foreign formats ------------------------------------------------------------------------------------------------
+
+
+def test_matlab_vectors_of_either_orientation(tmp_path):
+    time = np.arange(50) / 100
+    savemat(
+        tmp_path / "log.mat",
+        {"t": time[None], "qm": np.sin(time)[:, None], "gain": 3.0, "Q": np.ones((50, 2)), "note": "x"},
+    )
+    recording = load_recording(
+        tmp_path / "log.mat", LogMapping({"qpos/a": Source("qm"), "qpos/b": Source("Q/1")}, Source("t"))
+    )
+    np.testing.assert_array_equal(recording.time, time)
+    np.testing.assert_array_equal(recording["qpos/a"], np.sin(time))
+    with pytest.raises(ValueError, match="unknown column of the log 'gain'"):
+        load_recording(tmp_path / "log.mat", LogMapping({"qpos/a": Source("gain")}, Source("t")))
+
+
+def test_lerobot_episodes(tmp_path):
+    pa = pytest.importorskip("pyarrow")
+    from pyarrow import parquet
+
+    (tmp_path / "meta").mkdir()
+    (tmp_path / "data" / "chunk-000").mkdir(parents=True)
+    features = {
+        "action": {"dtype": "float32", "shape": [2], "names": {"motors": ["pan", "lift"]}},
+        "observation.state": {"dtype": "float32", "shape": [2], "names": ["pan", "lift"]},
+    }
+    (tmp_path / "meta" / "info.json").write_text(json.dumps({"fps": 30, "features": features}))
+    state = np.arange(20.0).reshape(10, 2)
+    table = pa.table(
+        {
+            "action": (state + 100).tolist(),
+            "observation.state": state.tolist(),
+            "timestamp": np.tile(np.arange(5) / 30, 2),
+            "frame_index": np.tile(np.arange(5), 2),
+            "episode_index": np.repeat([3, 4], 5),
+            "task": ["pick"] * 10,
+        }
+    )
+    path = tmp_path / "data" / "chunk-000" / "file-000.parquet"
+    parquet.write_table(table, path)
+    mapping = LogMapping(
+        {"ctrl/lift": Source("action/lift"), "qpos/lift": Source("observation.state/lift", unit="deg")}
+    )
+    for source in (tmp_path, path):
+        first, second = load_recordings(source, mapping)
+        assert (first.name, second.name) == ("episode_000003", "episode_000004")
+        np.testing.assert_allclose(second.time, np.arange(5) / 30)
+        np.testing.assert_allclose(second["ctrl/lift"], [111, 113, 115, 117, 119])
+        np.testing.assert_allclose(first["qpos/lift"], np.deg2rad([1, 3, 5, 7, 9]))
+    with pytest.raises(ValueError, match="holds 2 episodes: name one, episode=0 to 1"):
+        load_recording(path, mapping)
+    assert load_recording(path, mapping, episode=1).name == "episode_000004"
+    assert set(load_recording(path, episode=0).columns) == {
+        "action/pan", "action/lift", "observation.state/pan", "observation.state/lift",
+    }  # fmt: skip
+
+
+# --- damaged files --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.csv", b"", "the file is empty"),
+        ("a.csv", b"\n\n", "holds no line of data"),
+        ("a.csv", b"time,qpos/a\n", "no row has the 2 values"),
+        ("a.csv", b"time,qpos/a,qpos/a\n0,1,2\n", "'qpos/a' appears more than once"),
+        ("a.csv", b"t,qpos/a\n0,1\n", "no column 'time' among t, qpos/a"),
+        ("a.csv", b"\xff\xfe\x00\x81", "is not text"),
+        ("a.npz", b"PK no archive", "cannot be read"),
+        ("a.mat", b"no matlab", "cannot be read"),
+    ],
+)
+def test_a_damaged_file_is_a_clear_error(tmp_path, name, content, message):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ValueError, match=message):
+        load_recording(tmp_path / name)
+
+
+def test_parquet_without_or_with_its_package(tmp_path):
+    (tmp_path / "a.parquet").write_bytes(b"no parquet")
+    installed = importlib.util.find_spec("pyarrow") is not None
+    error, message = (ValueError, "cannot be read") if installed else (ImportError, r"simopt-envs\[measured\]")
+    with pytest.raises(error, match=message):
+        load_recording(tmp_path / "a.parquet")
+
+
+def test_no_file_can_run_code(tmp_path):
+    np.savez(tmp_path / "a.npz", time=np.array([{"code": 1}], dtype=object))
+    with pytest.raises(ValueError, match="cannot be read"):
+        load_recording(tmp_path / "a.npz")
+
+
+def test_rows_that_broke_and_cells_that_are_no_numbers_are_named(tmp_path):
+    (tmp_path / "a.csv").write_text("time,qpos/a,mode\n0,1,run\n0.1,,run\n0.2,3\n0.3,err,run\n0.4,5,ru")
+    recording = load_recording(tmp_path / "a.csv")
+    np.testing.assert_allclose(recording.time, [0, 0.1, 0.3, 0.4])
+    np.testing.assert_array_equal(recording["qpos/a"], [1, np.nan, np.nan, 5])
+    assert list(recording.columns) == ["qpos/a"], "a column of text is no signal"
+    messages = [str(warning) for warning in recording.warnings]
+    assert messages == [
+        "warning: 1 of 5 rows left out: they do not have 3 values; the first is data row 3",
+        "warning: qpos/a: 1 cells are no numbers and read as missing, the first is 'err'",
+    ]
+
+
+def test_a_broken_row_keeps_its_place_where_rows_are_counted(tmp_path):
+    (tmp_path / "a.txt").write_text("1\n2\n\n4\n5 6\n7\n\n")
+    mapping = LogMapping({"qpos/a": Source("a")}, time=None, sample_rate=10.0, column_names=("a",))
+    recording = load_recording(tmp_path / "a.txt", mapping)
+    np.testing.assert_allclose(recording.time, np.arange(6) / 10)
+    np.testing.assert_array_equal(recording["qpos/a"], [1, 2, np.nan, 4, np.nan, 7])
+    assert "2 of 6 rows read as missing" in str(recording.warnings[0])
+
+
+# --- real logs ------------------------------------------------------------------------------------------------------
+
+
+@needs_yaml
+@pytest.mark.skipif(not os.environ.get("SIMOPT_DATA"), reason="needs the recordings that SIMOPT_DATA names")
+def test_the_example_mappings_read_the_public_logs():
+    data = Path(os.environ["SIMOPT_DATA"])
+    emps = load_recording(data / "emps" / "DATA_EMPS.mat", EXAMPLES / "emps.yaml")
+    assert len(emps) == 24841
+    assert emps["ctrl/drive"].max() == pytest.approx(145.4708, rel=1e-5)
+    swing = load_recording(data / "free_swing" / "pendulum_free_swing_data_02.txt", EXAMPLES / "free_swing.yaml")
+    assert swing.time[0] == pytest.approx(1.1)
+    assert np.abs(swing["qpos/link"]).max() < 2.0
+    pendulum = load_recording(data / "double_pendulum" / "trajectory_12.csv", EXAMPLES / "double_pendulum.yaml")
+    assert set(pendulum.commands) == {"ctrl/shoulder", "ctrl/elbow"}
+    assert pendulum.period == pytest.approx(0.00162, rel=0.01)
