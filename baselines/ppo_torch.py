@@ -73,6 +73,9 @@ class PPOConfig:
     """The probability ratio is clipped to 1 ± this."""
     entropy_weight: float = 0.0
     """Weight of the entropy bonus."""
+    bound_weight: float = 0.5
+    """Weight of the squared distance by which mean actions exceed their bounds. Beyond them, exploration noise is clipped
+    away, and a policy that has to be trained further learns nothing."""
     target_kl: float = 0.01
     """KL divergence of one update that the step size aims at."""
     learning_rate: float = 1e-3
@@ -85,6 +88,8 @@ class PPOConfig:
     """Width of the two hidden layers of the actor, and of those of the critic."""
     initial_log_std: float = -0.3
     """Logarithm of the exploration noise at the start, where the action range is ±1."""
+    warm_start_log_std: float = -0.3
+    """A training that continues from a given policy begins with at least this much."""
     success_stop: float | None = None
     """Training ends early at this success rate (mean of `info["is_success"]` at episode ends)."""
     evaluation_envs: int = 8
@@ -417,11 +422,13 @@ def update(
     parameters = list(policy.parameters())
     for _ in range(config.epochs):
         for part in batch.shuffled(config.minibatches, generator):
-            ratio = (log_prob(part.actions, policy.actor(part.observations), policy.log_std) - part.log_probs).exp()
+            means = policy.actor(part.observations)
+            ratio = (log_prob(part.actions, means, policy.log_std) - part.log_probs).exp()
             clipped = ratio.clamp(1 - config.clip, 1 + config.clip)
             gain = torch.minimum(ratio * part.advantages, clipped * part.advantages).mean()
             value_error = (policy.critic(part.observations).squeeze(-1) - part.value_targets).square().mean()
-            loss = 0.5 * value_error - gain - config.entropy_weight * policy.log_std.sum()
+            excess = (means.abs() - 1).clamp(min=0).square().sum(-1).mean()
+            loss = 0.5 * value_error - gain - config.entropy_weight * policy.log_std.sum() + config.bound_weight * excess
             optimizer.zero_grad()
             loss.backward()
             nn.utils.clip_grad_norm_(parameters, config.max_grad_norm)
@@ -585,7 +592,9 @@ def _starting_policy(
             f"the given policy is for (observation size, action low, action high) {given}, "
             f"{env} has {(observation_size, low, high)}"
         )
-    return copy.deepcopy(policy)
+    policy = copy.deepcopy(policy)
+    policy.log_std.data.clamp_(min=config.warm_start_log_std)
+    return policy
 
 
 def evaluate(policy: TorchPolicy, env: VectorEnv, seed: int) -> Array:

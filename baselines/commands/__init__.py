@@ -1,0 +1,1 @@
+"""The subcommands of ``simopt-envs``, each a dataclass of its arguments with ``run``."""
