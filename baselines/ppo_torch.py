@@ -57,9 +57,9 @@ class PPOConfig:
     """Worlds stepped side by side."""
     num_steps: int = 50
     """Control steps of every world in one iteration; whole episodes, where all worlds end theirs together."""
-    iterations: int = 250
+    iterations: int = 200
     """Iterations (rollout and update) of a training from scratch."""
-    warm_start_iterations: int = 80
+    warm_start_iterations: int = 125
     """Iterations of a training that continues from a given policy."""
     epochs: int = 10
     """Passes over the batch in one update."""
@@ -76,12 +76,14 @@ class PPOConfig:
     bound_weight: float = 0.5
     """Weight of the squared distance by which mean actions exceed their bounds. Beyond them, exploration noise is clipped
     away, and a policy that has to be trained further learns nothing."""
-    target_kl: float = 0.01
+    target_kl: float = 0.04
     """KL divergence of one update that the step size aims at."""
     learning_rate: float = 1e-3
     """Step size of Adam at the start."""
     learning_rate_bounds: tuple[float, float] = (3e-4, 3e-3)
     """Least and greatest step size."""
+    scale_floor: float = 0.01
+    """Observations are scaled by their standard deviation, or by this share of their range if that is more."""
     max_grad_norm: float = 1.0
     """Gradients are scaled down to this norm."""
     hidden: int = 64
@@ -128,8 +130,13 @@ class Progress:
 
 
 class RunningNormaliser(nn.Module):
-    """Running mean and variance of a stream of vectors (Chan et al. 1979), in double precision."""
+    """Running mean and variance of a stream of vectors (Chan et al. 1979), in double precision.
 
+    `floor` is the least scale of each number. Without one, a channel that hardly moved in training would have its
+    sensor noise blown up, and throw the policy off as soon as it does move.
+    """
+
+    floor: Tensor
     mean: Tensor
     variance: Tensor
     count: Tensor
@@ -137,6 +144,7 @@ class RunningNormaliser(nn.Module):
     def __init__(self, size: int, clip: float) -> None:
         super().__init__()
         self.clip = clip
+        self.register_buffer("floor", torch.full((size,), 1e-4, dtype=torch.float64))
         self.register_buffer("mean", torch.zeros(size, dtype=torch.float64))
         self.register_buffer("variance", torch.ones(size, dtype=torch.float64))
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
@@ -153,8 +161,8 @@ class RunningNormaliser(nn.Module):
 
     @property
     def scale(self) -> Tensor:
-        """Standard deviation, kept above zero."""
-        return (self.variance + 1e-8).sqrt()
+        """Standard deviation, or the floor."""
+        return self.variance.sqrt().maximum(self.floor)
 
     def forward(self, x: Tensor) -> Tensor:
         """Normalise (n, size) to single precision, clipped to ± `clip`."""
@@ -585,7 +593,11 @@ def _starting_policy(
     observation_size = env.single_observation_space.shape[0]  # type: ignore[index]
     low, high = env.single_action_space.low.tolist(), env.single_action_space.high.tolist()  # type: ignore[attr-defined]
     if policy is None:
-        return TorchPolicy(observation_size, low, high, config.hidden, config.initial_log_std, generator)
+        fresh = TorchPolicy(observation_size, low, high, config.hidden, config.initial_log_std, generator)
+        observed = env.single_observation_space
+        width = torch.from_numpy(observed.high - observed.low).double()  # type: ignore[attr-defined]
+        fresh.observation_normaliser.floor[width.isfinite()] = config.scale_floor * width[width.isfinite()]
+        return fresh
     given = (policy.observation_size, policy.low.tolist(), policy.high.tolist())
     if given != (observation_size, low, high):
         raise ValueError(

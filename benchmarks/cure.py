@@ -4,7 +4,8 @@
 
 Each run starts from scratch: PPO under a cabinet at its nominal place (σ 2 cm, other physics varied too), a hidden system
 whose cabinet is shifted, three measured rollouts an iteration. A run that was interrupted goes on where it stopped, and one
-that is finished is only read. Prints a table of the runs and one of the targets.
+that is finished is only read. A run ends when it succeeds in 95 % of the evaluation episodes, or after the iterations that its
+shift may take. Prints a table of the runs and one of the targets.
 """
 
 from __future__ import annotations
@@ -18,13 +19,14 @@ import numpy as np
 import tyro
 
 import simopt_envs  # noqa: F401 - registers the environments
-from baselines.commands.inputs import distribution
+from baselines.commands.inputs import UPDATES, distribution
 from baselines.ppo_torch import TorchPPO
 from simopt_envs.adaptation import HiddenSystem, SimOpt
 from simopt_envs.adaptation.simulator import EnvSimulator
 
 ENV_ID = "SimOpt/Drawer-v0"
 ALLOWED = {0.15: 2, 0.22: 3}  # iterations that a shift may take
+CURED = 0.95  # a run stops at this success
 
 
 @dataclass
@@ -50,7 +52,7 @@ def run(shift: float, seed: int, args: Args) -> list[dict]:
         distribution(ENV_ID, simulator.parameters, ()),
         trainer=TorchPPO(),
         real_system=HiddenSystem(ENV_ID, parameters={"cabinet_x": shift}, noise=0.002),
-        updates_per_iteration=6,
+        updates_per_iteration=UPDATES,
         evaluation_episodes=args.evaluation_episodes,
         seed=seed,
         directory=folder,
@@ -64,6 +66,8 @@ def run(shift: float, seed: int, args: Args) -> list[dict]:
             f"cabinet_x {100 * mean:.1f} ± {100 * std:.1f} cm, {time.perf_counter() - start:.0f} s",
             flush=True,
         )
+        if step.target_success >= CURED:
+            break
     return json.loads((folder / "result.json").read_text())["iterations"]
 
 
@@ -75,14 +79,15 @@ def main(args: Args) -> None:
         successes = " → ".join(f"{100 * i['target_success']:.0f} %" for i in iterations)
         steps = sum(i["train_steps"] for i in iterations)
         print(f"| {100 * shift:.0f} cm | {seed} | {successes} | {steps:,} |")
-    print("\n| shift | iterations allowed | before ≤ 5 % | after ≥ 95 % | median iterations needed |\n|---|---|---|---|---|")
+    print(
+        "\n| shift | iterations allowed | before ≤ 5 % | after ≥ 95 % | median iterations needed |\n|---|---|---|---|---|"
+    )
     for shift in args.shifts:
         cures = [[i["target_success"] for i in runs[shift, seed]] for seed in args.seeds]
         before = sum(c[0] <= 0.05 for c in cures)
-        after = sum(c[-1] >= 0.95 for c in cures)
-        needed = [next((k for k, s in enumerate(c) if s >= 0.95), np.inf) for c in cures]
-        n = len(cures)
-        print(f"| {100 * shift:.0f} cm | {len(cures[0]) - 1} | {before} of {n} | {after} of {n} | {np.median(needed):g} |")
+        needed = [len(c) - 1 if c[-1] >= CURED else np.inf for c in cures]
+        after, n, allowed = np.isfinite(needed).sum(), len(cures), ALLOWED.get(shift, 3)
+        print(f"| {100 * shift:.0f} cm | {allowed} | {before} of {n} | {after} of {n} | {np.median(needed):g} |")
 
 
 if __name__ == "__main__":

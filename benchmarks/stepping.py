@@ -106,7 +106,9 @@ def main(args: Args) -> None:
     rows = [("native vector env", 128, native)]
     for workers in (2, 4, 8):
         makers = [lambda: gym.make(args.env_id)] * workers
-        rows.append(("AsyncVectorEnv", workers, best(gym.vector.AsyncVectorEnv(makers), workers, shape, args.repetitions)))
+        rows.append(
+            ("AsyncVectorEnv", workers, best(gym.vector.AsyncVectorEnv(makers), workers, shape, args.repetitions))
+        )
         rows.append(("SubprocVecEnv", workers, best(SubprocVecEnv(makers), workers, shape, args.repetitions)))
     print("\n| | worlds | control steps / s | native ÷ this |\n|---|---|---|---|")
     for name, count, rate in rows:

@@ -63,7 +63,16 @@ def worlds(env_class, num_envs, mode=AutoresetMode.SAME_STEP):
     return SyncVectorEnv([env_class] * num_envs, autoreset_mode=mode)
 
 
-SMALL = PPOConfig(num_envs=16, num_steps=20, iterations=30, warm_start_iterations=2, minibatches=4)
+SMALL = PPOConfig(
+    num_envs=16,
+    num_steps=20,
+    iterations=30,
+    warm_start_iterations=2,
+    minibatches=4,
+    target_kl=0.01,
+    initial_log_std=-0.7,
+    warm_start_log_std=-0.7,
+)
 
 
 def weights(policy):

@@ -47,7 +47,7 @@ class RandomizablePhysics(gym.Wrapper, RecordConstructorArgs):
         parameters = (parameters,) if isinstance(parameters, str) else tuple(parameters)
         RecordConstructorArgs.__init__(self, parameters=parameters)
         super().__init__(env)
-        model, _ = _model_and_data(env)
+        model, _ = model_and_data(env)
         self.parameters: ParameterSpace = model_parameters(model, parameters)
         self._bind(model)
 
@@ -57,7 +57,7 @@ class RandomizablePhysics(gym.Wrapper, RecordConstructorArgs):
         xi = self.parameters.values(options.pop("parameters", None) or {})
         self._write(xi)
         observation, info = self.env.reset(seed=seed, options=options or None)
-        model, data = _model_and_data(self.env)
+        model, data = model_and_data(self.env)
         if model is not self._model:
             self._bind(model)
             self._write(xi)
@@ -74,7 +74,8 @@ class RandomizablePhysics(gym.Wrapper, RecordConstructorArgs):
         self._writer.write_model(xi, self._model, self._scratch)
 
 
-def _model_and_data(env: gym.Env) -> tuple[mujoco.MjModel, mujoco.MjData]:
+def model_and_data(env: gym.Env) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    """MuJoCo's model and data of an environment, robosuite's among them; TypeError where it has none."""
     base: Any = env.unwrapped
     if hasattr(base, "sim"):  # robosuite wraps both once more
         model, data = getattr(base.sim.model, "_model", None), getattr(base.sim.data, "_data", None)

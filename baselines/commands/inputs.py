@@ -28,7 +28,7 @@ DEFAULT_VARY: Mapping[str, Mapping[str, float]] = {
 }
 """First standard deviations by environment: relative for logarithmic parameters, else in the parameter's unit."""
 
-UPDATES = 6
+UPDATES = 10
 """Updates of p(ξ) per iteration: at most 1.4 standard deviations each, they cross several centimetres of cabinet."""
 
 

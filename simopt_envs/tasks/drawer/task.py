@@ -37,10 +37,10 @@ class DrawerTask:
     camera = "side"
     weights = {  # noqa: RUF012 - a constant
         "distance": -5.0,
-        "angle": -1.5,
+        "angle": -0.7,
         "opening": 30.0,
         "grasp": 1.0,
-        "action": -0.1,
+        "action": -0.02,
     }
     observation_names = (*JOINTS, "handle_x", "handle_y", "handle_z")
     discrepancy_weights = np.array([0.5] * 7 + [1.0] * 3)
