@@ -74,8 +74,8 @@ class PPOConfig:
     entropy_weight: float = 0.0
     """Weight of the entropy bonus."""
     bound_weight: float = 0.5
-    """Weight of the squared distance by which mean actions exceed their bounds. Beyond them, exploration noise is clipped
-    away, and a policy that has to be trained further learns nothing."""
+    """Weight of the squared distance by which mean actions exceed their bounds. Beyond them, exploration noise is
+    clipped away, and a policy that has to be trained further learns nothing."""
     target_kl: float = 0.04
     """KL divergence of one update that the step size aims at."""
     learning_rate: float = 1e-3
@@ -436,7 +436,9 @@ def update(
             gain = torch.minimum(ratio * part.advantages, clipped * part.advantages).mean()
             value_error = (policy.critic(part.observations).squeeze(-1) - part.value_targets).square().mean()
             excess = (means.abs() - 1).clamp(min=0).square().sum(-1).mean()
-            loss = 0.5 * value_error - gain - config.entropy_weight * policy.log_std.sum() + config.bound_weight * excess
+            loss = (
+                0.5 * value_error - gain - config.entropy_weight * policy.log_std.sum() + config.bound_weight * excess
+            )
             optimizer.zero_grad()
             loss.backward()
             nn.utils.clip_grad_norm_(parameters, config.max_grad_norm)

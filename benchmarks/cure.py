@@ -2,10 +2,10 @@
 
     python benchmarks/cure.py [--shifts 0.15 0.22] [--seeds 0 1 2 3 4] [--out out/cure]
 
-Each run starts from scratch: PPO under a cabinet at its nominal place (σ 2 cm, other physics varied too), a hidden system
-whose cabinet is shifted, three measured rollouts an iteration. A run that was interrupted goes on where it stopped, and one
-that is finished is only read. A run ends when it succeeds in 95 % of the evaluation episodes, or after the iterations that its
-shift may take. Prints a table of the runs and one of the targets.
+Each run starts from scratch: PPO under a cabinet at its nominal place (σ 2 cm, other physics varied too), a hidden
+system whose cabinet is shifted, three measured rollouts an iteration. A run ends when it succeeds in 95 % of the
+evaluation episodes, or after the iterations that its shift may take; one that was interrupted goes on where it stopped,
+and one that is finished is only read. Prints a table of the runs and one of the targets.
 """
 
 from __future__ import annotations

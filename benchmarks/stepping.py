@@ -4,8 +4,8 @@
 
 All figures are ratios taken in one run. Two comparisons:
 
-* MuJoCo steps per CPU-second of the vector environment, a ξ per world, over those of a loop around ``mj_step`` through the
-  same worlds: the same models, initial states and commands. What is missing to 1 is observation, reward and Python.
+* MuJoCo steps per CPU-second of the vector environment, a ξ per world, over those of a loop around ``mj_step`` through
+  the same worlds: same models, initial states and commands. What is missing to 1 is observation, reward and Python.
 * Control steps per second over those of Gymnasium's AsyncVectorEnv and Stable-Baselines3's SubprocVecEnv, with the
   number of workers that suits them best.
 """

@@ -1,10 +1,10 @@
 """One update of p(ξ) from 9600 simulated rollouts, the paper's number, and from fewer.
 
-    python benchmarks/update.py --policy out/cure/shift_15_seed_0/000_train/policy
+    python benchmarks/update.py --policy out/cure/shift_15_seed_0/checkpoints/000_train/policy
 
-A policy trained at the nominal cabinet is measured three times on a system whose cabinet stands 15 cm off; p(ξ) is then
-updated a few times on these same rollouts. Shows the seconds of an update and how far the mean of cabinet_x came, by the
-number of simulated rollouts an update takes.
+A policy trained at the nominal cabinet is measured three times on a system whose cabinet stands 15 cm off; p(ξ) is
+then updated a few times on these same rollouts. Shows the seconds of an update and how far the mean of cabinet_x came,
+by the number of simulated rollouts an update takes.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ SHIFT = 0.15
 class Args:
     """What to measure."""
 
-    policy: Path = Path("out/cure/shift_15_seed_0/000_train/policy")
+    policy: Path = Path("out/cure/shift_15_seed_0/checkpoints/000_train/policy")
     """A policy trained at the nominal cabinet: benchmarks/cure.py leaves one."""
     rollouts: tuple[int, ...] = (120, 240, 480, 960, 9600)
     """Simulated rollouts of an update."""
@@ -54,12 +54,13 @@ def main(args: Args) -> None:
             p = distribution(ENV_ID, simulator.parameters, ())
             column = list(p.space.names).index("cabinet_x")
             real = measured.rollout(policy, 3, rng)
+            std_floor = 0.5 * p.std  # what the loop keeps while it searches
             path = []
             for _ in range(args.updates):
                 start = time.perf_counter()
                 xi = p.sample(number // 3, rng)
                 rollouts = simulator.rollout(policy, p.space, xi, real, int(rng.integers(2**31)))
-                p = REPS()(p, xi, cost(rollouts, real), rng).distribution
+                p = REPS()(p, xi, cost(rollouts, real), rng, std_floor).distribution
                 seconds.append(time.perf_counter() - start)
                 path.append(100 * p.mean[column])
             means.append(path)

@@ -157,7 +157,7 @@ def test_a_slippery_handle_slips(friction, succeeds):
 @needs_batch
 def test_single_equals_batched_through_a_grasp():
     rng = np.random.default_rng(0)
-    actions = np.clip(rng.normal(0, 0.5, (50, 3, 8)) + [0.2, 0.6, 0, 0.5, 0, 0, 0, 1], -1, 1)
+    actions = np.clip(rng.normal([0.2, 0.6, 0, 0.5, 0, 0, 0, 1], 0.5, (50, 3, 8)), -1, 1)
     venv = gym.make_vec(ENV_ID, num_envs=3)
     low, high = venv.unwrapped.parameters.low, venv.unwrapped.parameters.high
     nominal = venv.unwrapped.parameters.nominal

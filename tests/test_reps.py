@@ -211,11 +211,11 @@ def test_a_correlated_cost_gives_a_correlated_distribution():
 @pytest.mark.parametrize("std_floor", [0.2, [0.2, 0.3, 2.0]])
 def test_no_spread_falls_below_the_floor(std_floor):
     rng = np.random.default_rng(0)
-    rule = REPS(std_floor=std_floor)
+    rule = REPS()
     distribution = start(3)
     for _ in range(12):
         xi = distribution.sample(300, rng)
-        result = rule(distribution, xi, np.sum((xi - 0.5) ** 2, axis=1), rng)
+        result = rule(distribution, xi, np.sum((xi - 0.5) ** 2, axis=1), rng, std_floor)
         assert result.kl <= 1 + 1e-6
         distribution = result.distribution
     reachable = np.minimum(np.broadcast_to(std_floor, 3), 1.0)  # a floor above the first spread does not widen it
@@ -259,7 +259,7 @@ def test_relevance_tells_a_strong_parameter_from_the_rest_and_sees_many_weak_one
         (lambda: CEM(elite_fraction=1.5), "elite_fraction must be at most 1"),
         (lambda: REPS()(start(2), np.zeros((4, 3)), np.zeros(4), None), r"xi \(n, 2\) and costs \(n,\)"),
         (lambda: REPS()(start(2), np.full((4, 2), np.nan), np.zeros(4), None), "not valid physics"),
-        (lambda: REPS(std_floor=-1.0)(start(2), np.zeros((4, 2)), np.zeros(4), None), "std_floor must be"),
+        (lambda: REPS()(start(2), np.zeros((4, 2)), np.zeros(4), None, std_floor=-1.0), "std_floor must be"),
     ],
 )
 def test_wrong_arguments_are_refused(rule, message):

@@ -23,6 +23,9 @@ from simopt_envs.distributions.gaussian import Gaussian
 from simopt_envs.measured.trajectory import Trajectory
 from simopt_envs.physics.parameters import Array
 
+# Least standard deviations, as shares of the first ones. As long as no ξ drawn explains the measured episodes, p(ξ) has
+# not arrived, and to narrow it would only shorten its next steps, which go with its width.
+_FLOOR_SEARCHING, _FLOOR_ARRIVED = 0.5, 0.05
 _PHASES = ("train", "evaluate", "real", "measure", "update")
 
 
@@ -258,13 +261,15 @@ class SimOpt:
         measurement: _Measurement,
     ) -> Result:
         """One step of p(ξ) towards the measured episodes."""
-        draws, random = self._rngs(k, "update", 2, j)
+        draws, random, noise = self._rngs(k, "update", 3, j)
 
         def compute() -> Content:
             xi, costs = measurement.xi, measurement.costs
             if j > 0:
                 xi, costs, _, _ = self._simulate(distribution, policy, measurement.real, draws)
-            step = self.update(distribution, xi, costs, random)
+            arrived = judge(self.discrepancy, costs, measurement.real, noise).label != "unexplained"
+            floor = (_FLOOR_ARRIVED if arrived else _FLOOR_SEARCHING) * self.distribution.std
+            step = self.update(distribution, xi, costs, random, std_floor=floor)
             return {
                 "distribution": json.dumps(step.distribution.to_dict()),
                 "kl": step.kl,

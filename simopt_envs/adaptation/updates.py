@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -42,7 +41,12 @@ class Update(Protocol):
     """A rule that moves p(ξ) towards ξ of low cost."""
 
     def __call__(
-        self, distribution: Gaussian, xi: ArrayLike, costs: ArrayLike, rng: np.random.Generator
+        self,
+        distribution: Gaussian,
+        xi: ArrayLike,
+        costs: ArrayLike,
+        rng: np.random.Generator,
+        std_floor: ArrayLike | None = None,
     ) -> UpdateResult:
         """Update a distribution.
 
@@ -51,6 +55,8 @@ class Update(Protocol):
             xi: draws of it, physical values, (n, d).
             costs: their costs, (n,); a draw whose cost is not finite does not count.
             rng: for rules that draw.
+            std_floor: a number or (d,), unconstrained: no standard deviation falls below it, unless it was below
+                before. None: a thousandth of the width of the parameter's bounds.
 
         Raises:
             ValueError: for wrong shapes, or if no cost is finite.
@@ -69,26 +75,28 @@ class REPS:
     Attributes:
         epsilon: KL bound of a step, in nats.
         minimum_temperature: of the weights, in units of the cost.
-        std_floor: a number or one per parameter, unconstrained: least standard deviation;
-            None: a thousandth of the width of the parameter's bounds.
     """
 
     epsilon: float = 1.0
     minimum_temperature: float = 0.001
-    std_floor: float | Sequence[float] | None = None
 
     def __post_init__(self) -> None:
         """Raise ValueError for numbers that make no sense."""
         _require_positive(epsilon=self.epsilon, minimum_temperature=self.minimum_temperature)
 
     def __call__(
-        self, distribution: Gaussian, xi: ArrayLike, costs: ArrayLike, rng: np.random.Generator
+        self,
+        distribution: Gaussian,
+        xi: ArrayLike,
+        costs: ArrayLike,
+        rng: np.random.Generator,
+        std_floor: ArrayLike | None = None,
     ) -> UpdateResult:
         """See :meth:`Update.__call__`."""
         z, costs, valid = _valid_draws(distribution, xi, costs)
         temperature = reps_temperature(costs, self.epsilon, self.minimum_temperature)
         weights = softmax(-costs / temperature)
-        return _result(distribution, z, weights, valid, self.epsilon, self.std_floor, temperature)
+        return _result(distribution, z, weights, valid, self.epsilon, std_floor, temperature)
 
 
 @dataclass(frozen=True)
@@ -100,12 +108,10 @@ class CEM:
     Attributes:
         elite_fraction: share of the draws that count, rounded up.
         epsilon: KL bound of a step, in nats.
-        std_floor: as in :class:`REPS`.
     """
 
     elite_fraction: float = 0.2
     epsilon: float = 1.0
-    std_floor: float | Sequence[float] | None = None
 
     def __post_init__(self) -> None:
         """Raise ValueError for numbers that make no sense."""
@@ -114,13 +120,18 @@ class CEM:
             raise ValueError(f"elite_fraction must be at most 1, got {self.elite_fraction}")
 
     def __call__(
-        self, distribution: Gaussian, xi: ArrayLike, costs: ArrayLike, rng: np.random.Generator
+        self,
+        distribution: Gaussian,
+        xi: ArrayLike,
+        costs: ArrayLike,
+        rng: np.random.Generator,
+        std_floor: ArrayLike | None = None,
     ) -> UpdateResult:
         """See :meth:`Update.__call__`."""
         z, costs, valid = _valid_draws(distribution, xi, costs)
         last_elite = np.sort(costs)[int(np.ceil(self.elite_fraction * len(costs))) - 1]
         elite = costs <= last_elite  # all that tie with the last: equal costs leave the distribution as it is
-        return _result(distribution, z, elite / elite.sum(), valid, self.epsilon, self.std_floor)
+        return _result(distribution, z, elite / elite.sum(), valid, self.epsilon, std_floor)
 
 
 def reps_temperature(costs: Array, epsilon: float, minimum: float) -> float:
@@ -168,7 +179,7 @@ def _result(
     weights: Array,
     valid: Array,
     epsilon: float,
-    std_floor: float | Sequence[float] | None,
+    std_floor: ArrayLike | None,
     temperature: float | None = None,
 ) -> UpdateResult:
     fit = fit_gaussian(old, z, weights, epsilon, std_floor)

@@ -26,11 +26,11 @@ _LOOSE = 0.03  # m, standing wider than the bar by this much, the fingers earn n
 class DrawerTask:
     """See the package's docstring.
 
-    The paper's reward terms, with three changes that PPO with a tenth of the paper's samples needs to find the grasp and
-    the pull. The opening is rewarded for what it is instead of punished for what it lacks: the same but for a constant,
-    and a large constant in the reward is what a critic learns last. It counts only with the handle between the fingers,
-    as one finger hooked behind the bar opens the drawer too. And the bonus for fingers around the handle grows as they
-    close on it.
+    The paper's reward terms, with three changes that PPO with a tenth of the paper's samples needs to find the grasp
+    and the pull. The opening is rewarded for what it is instead of punished for what it lacks: the same but for a
+    constant, and a large constant in the reward is what a critic learns last. It counts only with the handle between
+    the fingers, as one finger hooked behind the bar opens the drawer too. And the bonus for fingers around the handle
+    grows as they close on it.
     """
 
     substeps = 15
