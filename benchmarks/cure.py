@@ -86,8 +86,9 @@ def main(args: Args) -> None:
         cures = [[i["target_success"] for i in runs[shift, seed]] for seed in args.seeds]
         before = sum(c[0] <= 0.05 for c in cures)
         needed = [len(c) - 1 if c[-1] >= CURED else np.inf for c in cures]
-        after, n, allowed = np.isfinite(needed).sum(), len(cures), ALLOWED.get(shift, 3)
-        print(f"| {100 * shift:.0f} cm | {allowed} | {before} of {n} | {after} of {n} | {np.median(needed):g} |")
+        after, n = np.isfinite(needed).sum(), len(cures)
+        row = (f"{100 * shift:.0f} cm", ALLOWED.get(shift, 3), f"{before} of {n}", f"{after} of {n}", np.median(needed))
+        print("| " + " | ".join(map(str, row)) + " |")
 
 
 if __name__ == "__main__":

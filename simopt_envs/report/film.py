@@ -137,7 +137,9 @@ def write_film(clips: Sequence[Clip], path: Path) -> Path:
 def _draw(env: gym.Env) -> Frames:
     try:
         return np.asarray(env.render(), dtype=np.uint8)
-    except Exception as error:  # without OpenGL, drivers and bindings fail in ways of their own
+    except RuntimeError:
+        raise  # says already what is missing
+    except Exception as error:  # environments of others: drivers and bindings fail in ways of their own
         raise RuntimeError(f"OpenGL cannot draw here ({type(error).__name__}: {error})") from error
 
 

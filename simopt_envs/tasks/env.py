@@ -83,13 +83,13 @@ class TaskEnv(gym.Env[Array, Array]):
         return self.task.observe(self.simulation)[0], float(outcome.reward[0]), False, bool(diverged[0]), info
 
     def render(self) -> Any:
-        """An image (height, width, 3) for "rgb_array"; a window for "human"."""
+        """An image (height, width, 3) for "rgb_array"; a window for "human". RuntimeError where OpenGL is missing."""
         if self.render_mode is None:
             return None
         if self._renderer is None:
             from simopt_envs.tasks.rendering import make_renderer
 
-            self._renderer = make_renderer(self.model, self.data, self.task.camera)
+            self._renderer = make_renderer(self.model, self.data, self.task.camera, self.render_mode)
         return self._renderer.render(self.render_mode)
 
     def close(self) -> None:
