@@ -19,13 +19,21 @@ def register_envs() -> None:
     """Register the environments with Gymnasium; calling it again changes nothing."""
     from gymnasium.envs.registration import register, registry
 
-    for name, horizon in (("Drawer", 50),):
+    for name, horizon in (("Drawer", 50), ("SwingPeg", 50)):
         if f"SimOpt/{name}-v0" not in registry:
             register(
                 id=f"SimOpt/{name}-v0",
                 entry_point=f"simopt_envs.tasks.{name.lower()}:make_env",
                 vector_entry_point=f"simopt_envs.tasks.{name.lower()}:make_vector_env",
                 max_episode_steps=horizon,
+            )
+    for name in ("Door", "Lift"):
+        if f"SimOpt/Robosuite{name}-v0" not in registry:
+            register(
+                id=f"SimOpt/Robosuite{name}-v0",
+                entry_point="simopt_envs.tasks.robosuite_env:RobosuiteEnv",
+                kwargs={"task": name},
+                max_episode_steps=500,
             )
 
 
