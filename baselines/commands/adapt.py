@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -11,14 +12,18 @@ import tyro
 from baselines.commands import inputs
 from baselines.commands.parameter_file import read_parameters
 from baselines.commands.progress import Display
+from baselines.commands.recordings import HeldOut, read_split
 from baselines.commands.runs import control_period, run_loop
 from simopt_envs.adaptation import CEM, REPS, EnvSimulator, HiddenSystem, RecordedSystem, ReplaySimulator, SimOpt
+from simopt_envs.adaptation.checkpoint import write_json
+from simopt_envs.adaptation.fitting import CMAES, LeastSquares, WindowMisfit, untold_combinations
 from simopt_envs.adaptation.updates import Update
 from simopt_envs.physics import ModelWriter
-from simopt_envs.report import Details
+from simopt_envs.report import Details, write_report
 
 MODEL_SUFFIXES = (".xml", ".mjcf", ".urdf")
 _XI_PER_UPDATE = 200
+_FITS = ("cmaes", "least-squares")
 
 
 @dataclass(frozen=True)
@@ -44,23 +49,27 @@ class Adapt:
     evaluation_episodes: int = 100
     """Environment: episodes that count successes on the target; they are never used to adapt."""
     data: tuple[Path, ...] = ()
-    """Model: recordings of the real system (CSV, Parquet, NPZ, MAT)."""
+    """Model: recordings of the real system (CSV, Parquet, NPZ, MAT, or minari:ID)."""
     parameters: Path | None = None
     """Model: YAML file that declares ξ."""
     mapping: Path | None = None
     """Model: YAML file that names the columns of foreign logs."""
     window: float = 0.5
     """Model: seconds of each stretch of a recording that is replayed."""
+    held_out: tuple[Path, ...] = ()
+    """Model: recordings that no fit sees, to say what the adapted model is worth."""
+    held_out_fraction: float = 0.25
+    """Model: without --held-out, the last part of each recording that no fit sees; 0 for none."""
     iterations: int = 5
-    """Iterations after the first training."""
+    """Iterations after the first training. The fits cmaes and least-squares need one, and make no more."""
     real_rollouts: int | None = None
     """Rollouts measured on the target per iteration; 3 by default. Model: windows, all by default."""
     rollouts: int | None = None
     """Simulated rollouts per update; 200 ξ for each real one by default."""
     updates: int = inputs.UPDATES
     """Updates of p(ξ) per iteration, on the same measured rollouts."""
-    update: Literal["reps", "cem"] = "reps"
-    """How p(ξ) is updated."""
+    update: Literal["reps", "cem", "cmaes", "least-squares"] = "reps"
+    """How p(ξ) is updated. Model: also by a fit to all windows, with a Laplace covariance."""
     epsilon: float = 1.0
     """Bound of the KL divergence of an update, in nats."""
     seed: int = 0
@@ -78,6 +87,9 @@ class Adapt:
 
     def _adapt_environment(self, typed: str) -> None:
         self._refuse("the model", "an environment", data=self.data, parameters=self.parameters, mapping=self.mapping)
+        self._refuse("the model", "an environment", **{"held-out": self.held_out})
+        if self.update in _FITS:
+            raise ValueError(f"--update {self.update} fits recordings; for an environment take reps or cem")
         if self.target is None:
             raise ValueError(f"{self.system} needs --target target.json, the hidden system to adapt to")
         target = inputs.Target.read(self.target)
@@ -110,41 +122,62 @@ class Adapt:
 
     def _adapt_model(self, typed: str) -> None:
         from simopt_envs.adaptation import window_trajectories
-        from simopt_envs.measured import audited, cut_windows, load_recordings
+        from simopt_envs.measured import cut_windows
         from simopt_envs.measured.logs import load_model
 
         self._refuse("an environment", "the model", target=self.target, vary=self.vary)
         if not self.data or self.parameters is None:
             raise ValueError(f"{self.system} needs --data LOG ... and --parameters xi.yaml to be adapted to recordings")
         model = load_model(self.system)
-        distribution = read_parameters(self.parameters)
-        ModelWriter(model, distribution.space)  # raises for places that the model does not have
-        logs = [load_recordings(path, self.mapping) for path in inputs.existing(self.data)]
-        recordings = [audited(recording, model) for log in logs for recording in log]
+        prior = read_parameters(self.parameters)
+        ModelWriter(model, prior.space)  # raises for places that the model does not have
+        recordings, held_out = read_split(
+            model, self.data, self.held_out, self.held_out_fraction, self.window, self.mapping
+        )
         windows = cut_windows(model, recordings, self.window)
-        simulator = ReplaySimulator(model, distribution.space, windows)
+        held_out_windows = cut_windows(model, held_out, self.window) if held_out else None
+        misfit = WindowMisfit(model, windows, prior)
         trajectories = window_trajectories(windows)
+        is_fit = self.update in _FITS
         real_rollouts = len(trajectories) if self.real_rollouts is None else self.real_rollouts
         display = Display()
         loop = SimOpt(
-            simulator,
-            distribution,
+            ReplaySimulator(model, prior.space, windows),
+            prior,
             None,
             RecordedSystem(trajectories),
-            update=self._update(),
+            update=self._fit(misfit) if is_fit else self._update(),
             simulated_rollouts=_XI_PER_UPDATE * real_rollouts if self.rollouts is None else self.rollouts,
             real_rollouts=real_rollouts,
-            updates_per_iteration=self.updates,
+            updates_per_iteration=1 if is_fit else self.updates,
             seed=self.seed,
             directory=self.out,
             on_event=display.event,
         )
-        warnings = tuple(dict.fromkeys(str(finding) for recording in recordings for finding in recording.warnings))
+        warnings = tuple(dict.fromkeys(str(f) for log in [*recordings, *held_out] for f in log.warnings))
         details = Details(typed, Path(self.system).name, float(windows.offsets[1]), notes=warnings)
-        run_loop(loop, self.iterations, display, details, resume_with(typed), resume=self.resume)
+        iterations = min(self.iterations, 1) if is_fit else self.iterations
+        last = run_loop(loop, iterations, display, details, resume_with(typed), resume=self.resume)
+        posterior = misfit.laplace(misfit.coordinates(last.distribution.mean))
+        findings = untold_combinations(prior, posterior)
+        result = json.loads((self.out / "result.json").read_text()) | {"untold": findings}
+        if held_out_windows is not None:
+            errors = HeldOut.of(model, held_out_windows, prior, last.distribution)
+            findings = [str(errors), *findings]
+            result["held_out"] = errors.to_dict()
+        else:
+            findings = ["Nothing was held out, so nothing here shows what the model is worth on new data.", *findings]
+        write_json(self.out / "result.json", result)
+        replace(details, notes=(*warnings, *findings)).save(self.out)
+        write_report(self.out)
+        for finding in findings:
+            display.say(finding)
 
     def _update(self) -> Update:
         return REPS(epsilon=self.epsilon) if self.update == "reps" else CEM(epsilon=self.epsilon)
+
+    def _fit(self, misfit: WindowMisfit) -> Update:
+        return CMAES(misfit) if self.update == "cmaes" else LeastSquares(misfit)
 
     def _refuse(self, owner: str, given: str, **options: object) -> None:
         """ValueError for an option that belongs to the other kind of system."""

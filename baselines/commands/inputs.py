@@ -25,6 +25,17 @@ DEFAULT_VARY: Mapping[str, Mapping[str, float]] = {
         "drawer_mass": 0.2,
         "handle_friction": 0.2,
     },
+    # A swing is over in a second and follows no correction, so little may vary at a time for a policy to work at all.
+    "SimOpt/SwingPeg-v0": {
+        "joint_gain_*": 0.03,
+        "joint_damping_*": 0.03,
+        "action_scaling_*": 0.02,
+        "rope_segment_length": 0.03,
+        "rope_bending_*": 0.1,
+        "rope_density": 0.05,
+        "peg_mass": 0.05,
+        "peg_friction": 0.1,
+    },
 }
 """First standard deviations by environment: relative for logarithmic parameters, else in the parameter's unit."""
 
@@ -97,15 +108,15 @@ def distribution(env_id: str, space: ParameterSpace, vary: Sequence[str]) -> Gau
     return Gaussian.around_nominal(space.subset(list(chosen)), list(chosen.values()))
 
 
-def make_trainer(name: Literal["torch", "sb3"], on_progress: Any = None) -> Trainer[Any]:
-    """The PPO of a name; ImportError saying what to install."""
+def make_trainer(name: Literal["torch", "sb3"], on_progress: Any = None, **config: Any) -> Trainer[Any]:
+    """The PPO of a name, the arguments of the algorithm in ``config``; ImportError saying what to install."""
     if name == "sb3":
         from baselines.ppo_sb3 import SB3
 
-        return SB3()
-    from baselines.ppo_torch import TorchPPO
+        return SB3(**config)
+    from baselines.ppo_torch import PPOConfig, TorchPPO
 
-    return TorchPPO(on_progress=on_progress)
+    return TorchPPO(PPOConfig(**config), on_progress)
 
 
 def require_free(directory: Path, resume: bool) -> None:

@@ -9,7 +9,8 @@ from typing import Annotated
 
 import tyro
 
-from baselines.commands.inputs import existing, require_free
+from baselines.commands.inputs import require_free
+from baselines.commands.recordings import existing_logs
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,7 @@ class Inspect:
     """Audit a recording: what is in it, and what is wrong with it. Exit code 1 if something is."""
 
     log: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="LOG")]
-    """Recording: CSV, Parquet, NPZ, MAT, or the folder of a data set."""
+    """Recording: CSV, Parquet, NPZ, MAT, the folder of a data set, or minari:ID."""
     model: Path | None = None
     """MJCF file to check names, ranges and units against."""
     mapping: Path | None = None
@@ -43,7 +44,7 @@ class Inspect:
         """Print the audit; ``typed`` is the command line."""
         from simopt_envs.measured import inspect_log
 
-        existing([self.log])
+        existing_logs([self.log])
         if self.out is not None:
             require_free(self.out, resume=False)
         inspection = inspect_log(self.log, self.model, self.mapping, self.out)
@@ -74,4 +75,4 @@ class Replay:
         from simopt_envs.measured import replay_log
 
         require_free(self.out, resume=False)
-        print(replay_log(self.model, existing(self.data), self.mapping, self.out, self.window, self.keyframe))
+        print(replay_log(self.model, existing_logs(self.data), self.mapping, self.out, self.window, self.keyframe))
