@@ -79,9 +79,8 @@ def main(args: Args) -> None:
         successes = " → ".join(f"{100 * i['target_success']:.0f} %" for i in iterations)
         steps = sum(i["train_steps"] for i in iterations)
         print(f"| {100 * shift:.0f} cm | {seed} | {successes} | {steps:,} |")
-    print(
-        "\n| shift | iterations allowed | before ≤ 5 % | after ≥ 95 % | median iterations needed |\n|---|---|---|---|---|"
-    )
+    print("\n| shift | iterations allowed | before ≤ 5 % | after ≥ 95 % | median iterations needed |")
+    print("|---|---|---|---|---|")
     for shift in args.shifts:
         cures = [[i["target_success"] for i in runs[shift, seed]] for seed in args.seeds]
         before = sum(c[0] <= 0.05 for c in cures)

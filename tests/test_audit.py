@@ -12,6 +12,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from conftest import needs_examples
 
 from simopt_envs.measured import Finding, Recording, audit, audited, inspect_log, load_recording
 
@@ -287,6 +288,7 @@ def test_inspecting_writes_a_table_and_a_plot(tmp_path):
     assert (tmp_path / "out" / "run.png").stat().st_size > 10_000
 
 
+@needs_examples
 @pytest.mark.skipif(
     not os.environ.get("SIMOPT_DATA") or importlib.util.find_spec("yaml") is None,
     reason="needs pyyaml and the recordings that SIMOPT_DATA names",

@@ -10,6 +10,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from conftest import needs_examples
 
 from simopt_envs.measured import (
     Recording,
@@ -328,6 +329,7 @@ def example(name: str) -> mujoco.MjModel:
     return mujoco.MjModel.from_xml_path(str(EXAMPLES / f"{name}.xml"))
 
 
+@needs_examples
 @needs_data
 def test_double_pendulum_published_models_give_the_known_errors():
     """0.5 s on runs 4 to 6: 0.107, 0.183 rad without friction and 0.037, 0.059 with the published one."""
@@ -340,6 +342,7 @@ def test_double_pendulum_published_models_give_the_known_errors():
     np.testing.assert_allclose(replay(full, runs, seconds=0.5).rmse[0, :2], [0.037, 0.059], rtol=0.05)
 
 
+@needs_examples
 @needs_data
 def test_emps_published_model_follows_the_whole_recording():
     """Mass, friction and offset as published keep within 10 mm for 24.8 s; the mass alone drifts off by metres."""
@@ -353,6 +356,7 @@ def test_emps_published_model_follows_the_whole_recording():
     assert result.start_rmse[0] < 0.001
 
 
+@needs_examples
 @needs_data
 def test_free_swing_repeats_the_frequency_of_the_nominal_link():
     folder = Path(os.environ["SIMOPT_DATA"]) / "free_swing"

@@ -108,15 +108,15 @@ def distribution(env_id: str, space: ParameterSpace, vary: Sequence[str]) -> Gau
     return Gaussian.around_nominal(space.subset(list(chosen)), list(chosen.values()))
 
 
-def make_trainer(name: Literal["torch", "sb3"], on_progress: Any = None, **config: Any) -> Trainer[Any]:
-    """The PPO of a name, the arguments of the algorithm in ``config``; ImportError saying what to install."""
+def make_trainer(name: Literal["torch", "sb3"], on_progress: Any = None) -> Trainer[Any]:
+    """The PPO of a name; ImportError saying what to install."""
     if name == "sb3":
         from baselines.ppo_sb3 import SB3
 
-        return SB3(**config)
-    from baselines.ppo_torch import PPOConfig, TorchPPO
+        return SB3()
+    from baselines.ppo_torch import TorchPPO
 
-    return TorchPPO(PPOConfig(**config), on_progress)
+    return TorchPPO(on_progress=on_progress)
 
 
 def require_free(directory: Path, resume: bool) -> None:

@@ -96,8 +96,8 @@ def _check_rate(recording: Recording, sample_rate: float) -> None:
 
 
 def _tables(path: str | Path, mapping: LogMapping | None) -> Iterator[_Table]:
-    if isinstance(path, str) and path.startswith("minari:"):
-        yield from _minari(path.removeprefix("minari:"), mapping)
+    if str(path).startswith("minari:"):
+        yield from _minari(str(path).removeprefix("minari:"), mapping)
         return
     path = Path(path)
     if not path.exists():

@@ -114,7 +114,7 @@ class RobosuiteEnv(gym.Env[Array, Any]):
         if self._renderer is None:
             from simopt_envs.tasks.rendering import make_renderer
 
-            self._renderer = make_renderer(self.model, self.data, self._camera)
+            self._renderer = make_renderer(self.model, self.data, self._camera, self.render_mode)
         return self._renderer.render(self.render_mode)
 
     def close(self) -> None:
