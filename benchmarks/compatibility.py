@@ -46,18 +46,18 @@ class Case:
     Attributes:
         env_id: its id.
         parameter: ξ.
-        library: the package it needs.
+        package: the package it needs.
     """
 
     env_id: str
     parameter: str
-    library: str = "gymnasium"
+    package: str = "gymnasium"
 
     def make_env(self) -> str | Callable[[], gym.Env]:
         """What the loop takes: our own by id, others made ready, with episodes of a few steps."""
-        if self.library == "simopt_envs":
+        if self.package == "simopt_envs":
             return self.env_id
-        prefix = "gymnasium_robotics:" if self.library == "gymnasium_robotics" else ""
+        prefix = "gymnasium_robotics:" if self.package == "gymnasium_robotics" else ""
         return AdaptableEnv(partial(gym.make, prefix + self.env_id, max_episode_steps=STEPS), [self.parameter])
 
 
@@ -194,7 +194,7 @@ def main(args: Args) -> int:
     rows = [f"{installed()}\n", f"| environment | ξ | {' | '.join(COLUMNS)} |", "|---" * (2 + len(COLUMNS)) + "|"]
     failures = 0
     for case in CASES:
-        if find_spec(case.library) is None or (case.library == "simopt_envs" and case.env_id not in gym.registry):
+        if find_spec(case.package) is None or (case.package == "simopt_envs" and case.env_id not in gym.registry):
             continue
         start = time.perf_counter()
         outcomes = [outcome(check, case) for check in COLUMNS.values()]

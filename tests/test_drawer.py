@@ -179,6 +179,17 @@ def test_single_equals_batched_through_a_grasp():
         np.testing.assert_allclose(np.array(many)[:, world], one, atol=1e-9)
 
 
+@needs_batch
+@pytest.mark.parametrize(("num_envs", "num_threads"), [(16, 1), (16, 2), (256, 1), (256, 2)])
+def test_a_world_does_not_depend_on_how_many_there_are(num_envs, num_threads):
+    actions = np.random.default_rng(1).uniform(-1, 1, (30, num_envs, 8))
+    alone = gym.make_vec(ENV_ID, num_envs=1, num_threads=1)
+    among = gym.make_vec(ENV_ID, num_envs=num_envs, num_threads=num_threads)
+    np.testing.assert_array_equal(alone.reset(seed=7)[0][0], among.reset(seed=7)[0][0])
+    for a in actions:
+        np.testing.assert_array_equal(alone.step(a[:1])[0][0], among.step(a)[0][0])
+
+
 def test_rendering_gives_a_picture_or_says_what_is_missing():
     env = gym.make(ENV_ID, render_mode="rgb_array")
     env.reset(seed=0)
