@@ -191,3 +191,11 @@ def test_two_setters_of_one_place_are_refused():
     twice = [Parameter(n, "1", 1.0, 0.1, 2.0, writes=(Write("dof_damping", "slide"),)) for n in ("a", "b")]
     with pytest.raises(ValueError, match="several parameters set the same element of dof_damping"):
         ModelWriter(model, ParameterSpace(twice))
+
+
+def test_an_added_value_is_multiplied_by_its_factor():
+    model, data = compiled()
+    add = Write("body_mass", "cart", operation="add", factor=-2.0)
+    space = ParameterSpace([Parameter("less", "kg", 0.0, 0.0, 1.0, "linear", (add,))])
+    ModelWriter(model, space).write_model(np.array([0.5]), model, data)
+    assert model.body("cart").mass[0] == pytest.approx(2.0, rel=1e-12)

@@ -155,7 +155,8 @@ def test_many_parameter_vectors_at_once_are_each_as_alone(engine):
     )
     windows = cut_windows(model, recording, 0.2)
     xi = np.array([[1.0, 0.3], [5.0, 0.3], [1.0, 0.6]])
-    together = engine(model, space, windows, 2).run(xi, windows.starts)
+    starts = windows.starts.select(np.tile(np.arange(len(windows)), len(xi)))
+    together = engine(model, space, windows, 2).run(xi, starts)
     assert together.shape == (3, len(windows), 101, len(windows.channels))
     for row, predicted in zip(xi, together, strict=True):
         alone = cart()

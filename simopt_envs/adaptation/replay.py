@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any
 
 import mujoco
@@ -14,10 +14,12 @@ from numpy.typing import NDArray
 from simopt_envs.adaptation.protocols import Policy
 from simopt_envs.adaptation.rollouts import Rollouts
 from simopt_envs.distributions.distribution import Sampler
-from simopt_envs.measured.states import States
+from simopt_envs.engine import Engine, LocalEngine
 from simopt_envs.measured.trajectory import Trajectory
 from simopt_envs.measured.windows import Windows, WindowSimulator
 from simopt_envs.physics.parameters import Array, ParameterSpace
+
+_XI_PER_TASK = 64
 
 
 def window_trajectories(windows: Windows) -> list[Trajectory]:
@@ -39,18 +41,21 @@ class ReplaySimulator:
         model: the model; it is not changed.
         parameters: ξ.
         windows: those that the real system's trajectories come from (:func:`window_trajectories`).
-        num_threads: 0 for one per core.
+        engine: does the replays, 64 ξ a task.
 
     Attributes:
         discrepancy_weights: (c,), the inverse of each channel's standard deviation, so that units do not matter.
     """
 
-    def __init__(self, model: mujoco.MjModel, parameters: ParameterSpace, windows: Windows, num_threads: int = 0):
+    def __init__(
+        self, model: mujoco.MjModel, parameters: ParameterSpace, windows: Windows, engine: Engine | None = None
+    ):
         self.parameters = parameters
         self.observation_names = windows.names
         scale = windows.channel_scale()
         self.discrepancy_weights: Array | None = 1 / np.where(scale > 0, scale, 1.0)
-        self._model, self._windows, self._num_threads = model, windows, num_threads
+        self.engine: Engine = engine or LocalEngine()
+        self._model, self._windows, self._num_threads = model, windows, self.engine.num_threads
         self._index = {measured.tobytes(): i for i, measured in enumerate(windows.measured)}
         self._simulator: tuple[tuple[int, ...], ParameterSpace, WindowSimulator] | None = None
 
@@ -74,11 +79,17 @@ class ReplaySimulator:
         Raises:
             ValueError: for a trajectory that is none of the windows.
         """
-        observations = self._simulate(tuple(map(self._find, real)), space)(xi)
+        chosen = tuple(map(self._find, real))
+        tasks = np.split(xi, range(_XI_PER_TASK, len(xi), _XI_PER_TASK))
+        observations = np.concatenate(self.engine.map(_replay, tasks, (self, chosen, space)))
         n, r, samples = observations.shape[:3]
         actions = np.broadcast_to(np.stack([t.actions for t in real]), (n, r, *real[0].actions.shape))
         diverged = np.asarray(np.isnan(observations).any(axis=(2, 3)))
         return Rollouts(observations, actions, np.full((n, r), samples - 1), diverged, None)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what belongs to this process: the simulator, and the engine."""
+        return self.__dict__ | {"_simulator": None, "engine": None}
 
     def _find(self, trajectory: Trajectory) -> int:
         index = self._index.get(trajectory.observations.tobytes())
@@ -94,13 +105,16 @@ class ReplaySimulator:
         return self._simulator[2]
 
 
+def _replay(xi: Array, simulator: ReplaySimulator, chosen: tuple[int, ...], space: ParameterSpace) -> Array:
+    return simulator._simulate(chosen, space)(xi)
+
+
 def _select(windows: Windows, chosen: NDArray[np.intp]) -> Windows:
     """Some of the windows."""
-    starts = States(*(getattr(windows.starts, field.name)[chosen] for field in fields(States)))
     per_window = ("start_time", "measured", "commands", "past_commands")
     return replace(
         windows,
         recording=tuple(windows.recording[i] for i in chosen),
-        starts=starts,
+        starts=windows.starts.select(chosen),
         **{name: getattr(windows, name)[chosen] for name in per_window},
     )

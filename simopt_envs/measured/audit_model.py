@@ -123,7 +123,7 @@ def _velocity(
 ) -> Iterator[Finding]:
     position = joints[channel.object]
     measured, derivative = _common(grid[channel.name], position.velocity)
-    if len(derivative) < LEAST_SAMPLES or derivative.std() < CLEAR_MOTION * position.velocity_error:
+    if len(derivative) < LEAST_SAMPLES or derivative.std() < CLEAR_MOTION * np.median(position.velocity_error):
         return
     name = f"qpos/{model.joint(channel.object).name}"
     correlation, lag = _best_lag(measured, derivative, grid.period)

@@ -35,7 +35,7 @@ class BatchEngine:
         self._fields = {name: self._batch.expand(name) for name in self._writer.fields}
 
     def run(self, xi: Array, starts: States) -> Array:
-        """The windows' channels (n, w, S, c) for ξ (n, d) from w starts; NaN from where a world diverged."""
+        """The windows' channels (n, w, S, c) for ξ (n, d) from n w starts; NaN from where a world diverged."""
         windows, num_windows = self._windows, len(self._windows)
         if len(xi) * num_windows > self._batch.nsim:
             self._grow(len(xi))
@@ -45,7 +45,7 @@ class BatchEngine:
             batch.set_const(worlds)
         batch.reset(worlds, stage=int(mujoco.mjtStage.mjSTAGE_NONE))
         for field, values in _initial_fields(self._model, windows, starts).items():
-            batch.bind(field)[worlds] = np.tile(values, (len(xi), 1))
+            batch.bind(field)[worlds] = values
         # One step more than the window is long: derived fields lag the state by a step.
         commands = np.concatenate([windows.commands, windows.commands[:, -1:]], axis=1)
         fields = list(field_sizes(self._model, windows.channels))
@@ -60,7 +60,7 @@ class BatchEngine:
         series = {}
         for field in fields:
             if field in start:
-                first = np.tile(start[field], (len(xi), 1))[:, None]
+                first = start[field][:, None]
                 series[field] = np.concatenate([first, records[field][:, :-1]], axis=1)[:, :: windows.stride]
             else:
                 series[field] = records[field][:, :: windows.stride]
@@ -88,14 +88,14 @@ class RolloutEngine:
         initial = _initial_states(model, windows, starts)
         commands = np.concatenate([windows.commands, windows.commands[:, -1:]], axis=1)
         states, sensors = rollout.rollout(
-            [world for world in models for _ in initial],
+            [world for world in models for _ in range(len(windows))],
             self._data,
-            np.tile(initial, (len(xi), 1)),
+            initial,
             np.tile(commands, (len(xi), 1, 1)) if model.nu else None,
             nstep=commands.shape[1],
         )
         clock = states[..., 0]
-        states = np.concatenate([np.tile(initial, (len(xi), 1))[:, None], states[:, :-1]], axis=1)
+        states = np.concatenate([initial[:, None], states[:, :-1]], axis=1)
         qpos, qvel = states[..., 1 : 1 + model.nq], states[..., 1 + model.nq : 1 + model.nq + model.nv]
         series = {"qpos": qpos, "qvel": qvel, "sensordata": sensors}
         series = {field: values[:, :: windows.stride] for field, values in series.items()}
@@ -133,17 +133,17 @@ def _site_positions(model: mujoco.MjModel, data: mujoco.MjData, qpos: Array) -> 
 
 
 def _initial_fields(model: mujoco.MjModel, windows: Windows, starts: States) -> dict[str, Array]:
-    """The state fields to write at the start, name -> (w, ...)."""
+    """The state fields to write at the starts, name -> (n w, ...)."""
     fields = {"qpos": starts.qpos, "qvel": starts.qvel}
     if not (model.na or model.nhistory):
         return fields
     data = mujoco.MjData(model)
-    act, history = np.zeros((len(windows), model.na)), np.zeros((len(windows), model.nhistory))
-    for w in range(len(windows)):
+    act, history = np.zeros((len(starts), model.na)), np.zeros((len(starts), model.nhistory))
+    for i in range(len(starts)):
         mujoco.mj_resetData(model, data)
-        data.qpos[:], data.qvel[:] = starts.qpos[w], starts.qvel[w]
-        _settle_actuators(model, data, windows.past_commands[w])
-        act[w], history[w] = data.act, data.history
+        data.qpos[:], data.qvel[:] = starts.qpos[i], starts.qvel[i]
+        _settle_actuators(model, data, windows.past_commands[i % len(windows)])
+        act[i], history[i] = data.act, data.history
     return fields | ({"act": act} if model.na else {}) | ({"history": history} if model.nhistory else {})
 
 
@@ -167,14 +167,14 @@ def _settle_actuators(model: mujoco.MjModel, data: mujoco.MjData, past: Array) -
 
 
 def _initial_states(model: mujoco.MjModel, windows: Windows, starts: States) -> Array:
-    """Full physics states (w, n) at the start."""
+    """Full physics states (n w, ...) at the starts."""
     spec = mujoco.mjtState.mjSTATE_FULLPHYSICS
-    data, rows = mujoco.MjData(model), np.empty((len(windows), mujoco.mj_stateSize(model, spec)))
+    data, rows = mujoco.MjData(model), np.empty((len(starts), mujoco.mj_stateSize(model, spec)))
     fields = _initial_fields(model, windows, starts)
-    for w in range(len(windows)):
+    for i, row in enumerate(rows):
         for field, values in fields.items():
-            getattr(data, field)[:] = values[w]
-        mujoco.mj_getState(model, data, rows[w], spec)
+            getattr(data, field)[:] = values[i]
+        mujoco.mj_getState(model, data, row, spec)
     return rows
 
 

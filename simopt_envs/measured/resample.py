@@ -104,15 +104,16 @@ class Smoothed:
     Attributes:
         value, velocity, acceleration: (T,), NaN where the signal was.
         noise: standard deviation of one sample around the smooth signal.
-        value_error, velocity_error: standard errors of one smoothed value and velocity.
+        value_error, velocity_error: standard errors of each smoothed value and velocity, (T,): larger near the ends,
+            where there is less on one side to smooth with.
     """
 
     value: Array
     velocity: Array
     acceleration: Array
     noise: float
-    value_error: float
-    velocity_error: float
+    value_error: Array
+    velocity_error: Array
 
 
 def smooth(values: Array, period: float) -> Smoothed:
@@ -145,5 +146,19 @@ def smooth(values: Array, period: float) -> Smoothed:
     value, velocity, acceleration = (
         np.where(missing, np.nan, signal.savgol_filter(filled, window, _ORDER, deriv=d, delta=period)) for d in range(3)
     )
-    norms = [np.linalg.norm(signal.savgol_coeffs(window, _ORDER, deriv=d, delta=period)) for d in range(2)]
-    return Smoothed(value, velocity, acceleration, noise, noise * float(norms[0]), noise * float(norms[1]))
+    value_error, velocity_error = (noise * _filter_norms(len(values), window, d, period) for d in range(2))
+    return Smoothed(value, velocity, acceleration, noise, value_error, velocity_error)
+
+
+def _filter_norms(samples: int, window: int, derivative: int, period: float) -> Array:
+    """Norm of the filter that gives each of the smoothed samples, (T,); near the ends the polynomial is of the end."""
+
+    def norm(position: int) -> float:
+        weights = signal.savgol_coeffs(window, _ORDER, derivative, period, pos=position, use="dot")
+        return float(np.linalg.norm(weights))
+
+    half = window // 2
+    norms = np.full(samples, norm(half))
+    norms[:half] = [norm(position) for position in range(half)]
+    norms[samples - half :] = norms[:half][::-1]
+    return norms

@@ -37,6 +37,10 @@ class States:
     def __len__(self) -> int:
         return len(self.qpos)
 
+    def select(self, rows: NDArray[np.intp]) -> States:
+        """Some of them, in the order given."""
+        return States(self.qpos[rows], self.qvel[rows], self.qpos_error[rows], self.qvel_error[rows])
+
 
 def reference_qpos(model: mujoco.MjModel, keyframe: str | None = None) -> Array:
     """The model's reference posture or that of a named keyframe, (nq,); ValueError if there is none so named."""
@@ -80,7 +84,8 @@ def estimate_states(
         qpos[:, channel.index] = signal.value[samples]
         rates[:, channel.index] = signal.velocity[samples]
         dofs = _dofs_of(model, channel)
-        qpos_error[:, dofs], qvel_error[:, dofs] = signal.value_error, signal.velocity_error
+        qpos_error[:, dofs] = signal.value_error[samples, None]
+        qvel_error[:, dofs] = signal.velocity_error[samples, None]
         unseen[dofs] = False
     if np.isnan(qpos).any():
         raise ValueError(f"{recording.name}: a joint position is missing at a sample whose state is wanted")
@@ -93,7 +98,7 @@ def estimate_states(
         measured = signal.value[samples]
         good = np.isfinite(measured)
         qvel[good, channel.index] = measured[good]
-        qvel_error[good, channel.index] = signal.value_error
+        qvel_error[good, channel.index] = signal.value_error[samples][good]
     return states
 
 
@@ -135,15 +140,14 @@ def _fit_unseen(
     def measured(channels: list[Channel], attribute: str, sample: int) -> Array:
         return np.array([getattr(smoothed[c.name], attribute)[sample] for c in channels])
 
-    position_error = np.maximum([smoothed[c.name].value_error for c in position], _LEAST_ERROR)
-    rate_error = np.maximum(
-        [smoothed[c.name].velocity_error for c in position] + [smoothed[c.name].value_error for c in velocity],
-        _LEAST_ERROR,
-    )
     offset = np.zeros(len(dofs))
     for w, sample in enumerate(samples):
         reference, known_velocity = states.qpos[w].copy(), states.qvel[w].copy()
         targets = measured(position, "value", sample)
+        position_error = np.maximum(measured(position, "value_error", sample), _LEAST_ERROR)
+        rate_error = np.append(
+            measured(position, "velocity_error", sample), measured(velocity, "value_error", sample)
+        ).clip(_LEAST_ERROR)
 
         def posture(offset: Array, reference: Array = reference) -> Array:
             qpos, tangent = reference.copy(), np.zeros(model.nv)
@@ -151,9 +155,9 @@ def _fit_unseen(
             mujoco.mj_integratePos(model, qpos, tangent, 1.0)
             return qpos
 
-        def misfit(offset: Array, targets: Array = targets) -> Array:
+        def misfit(offset: Array, targets: Array = targets, error: Array = position_error) -> Array:
             values = _read(model, data, posture(offset), np.zeros(model.nv), position)
-            return np.append(np.nan_to_num((values - targets) / position_error), offset / _POSITION_PRIOR)
+            return np.append(np.nan_to_num((values - targets) / error), offset / _POSITION_PRIOR)
 
         fit = least_squares(misfit, offset)
         offset = fit.x  # the next window starts from here

@@ -156,7 +156,7 @@ class WindowSimulator:
 
         Args:
             xi: (n, d); None for the model as it is, n = 1.
-            starts: w states other than the windows' own.
+            starts: states other than the windows' own: w, or n w, the first ξ's w first.
 
         Returns:
             (n, w, S, c), NaN from where a simulation diverged.
@@ -166,8 +166,11 @@ class WindowSimulator:
         """
         values = self.space.validate(np.atleast_2d(self.space.nominal if xi is None else np.asarray(xi)))
         starts = self.windows.starts if starts is None else starts
-        chunks = [values[i : i + self._xi_at_once] for i in range(0, len(values), self._xi_at_once)]
-        return np.concatenate([self._engine.run(chunk, starts) for chunk in chunks])
+        if len(starts) == len(self.windows):
+            starts = starts.select(np.tile(np.arange(len(starts)), len(values)))
+        per_xi = np.arange(len(starts)).reshape(len(values), -1)
+        chunks = [slice(i, i + self._xi_at_once) for i in range(0, len(values), self._xi_at_once)]
+        return np.concatenate([self._engine.run(values[c], starts.select(per_xi[c].ravel())) for c in chunks])
 
 
 def simulate_windows(

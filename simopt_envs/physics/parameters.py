@@ -29,9 +29,10 @@ class Write:
         object: name of the joint, body, geom, ... whose rows are written. None for options.
         index: columns within a row, ``(0, 1)`` of ``pair_friction``; None writes the whole row.
         operation: ``"set"`` writes the value, ``"scale"`` multiplies the remembered nominal by
-            (value / the parameter's nominal) ** power, ``"add"`` adds the value to it. Several parameters may write
-            the same place: it is set first, then scaled, then shifted, always from the model as it was compiled.
+            (value / the parameter's nominal) ** power, ``"add"`` adds factor * value to it. Several parameters may
+            write the same place: it is set first, then scaled, then shifted, always from the model as it was compiled.
         power: exponent of ``"scale"``: a rod's mass goes with the second power of its width.
+        factor: of ``"add"``: a force at a joint is a gear's ratio times smaller at its motor.
     """
 
     field: str
@@ -39,6 +40,7 @@ class Write:
     index: tuple[int, ...] | None = None
     operation: Operation = "set"
     power: float = 1.0
+    factor: float = 1.0
 
 
 @dataclass(frozen=True)

@@ -2,15 +2,16 @@
 
 Tasks, environments and the driver see only :class:`Simulation`. :class:`SingleSimulation` runs one world on any MuJoCo,
 :class:`BatchSimulation` many on the threads of ``mujoco.batch`` (MuJoCo >= 3.17). Both give the same trajectories.
+:class:`~simopt_envs.physics.warp_simulation.WarpSimulation` runs thousands on a GPU, in single precision.
 """
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Any, Protocol
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from simopt_envs.physics.parameters import Array, ParameterSpace
 from simopt_envs.physics.writer import ModelWriter, model_field
@@ -20,16 +21,24 @@ _DIVERGED = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL,
 
 
 class Simulation(Protocol):
-    """n worlds of one model. Arrays have the worlds as first axis."""
+    """n worlds of one model. Arrays have the worlds as first axis.
+
+    What comes and goes with every step are arrays of the simulation's own kind, NumPy's or torch's on some device;
+    what is told of worlds that begin an episode are NumPy's.
+    """
 
     num_worlds: int
     model: mujoco.MjModel
 
-    def data(self, field: str) -> np.ndarray:
+    def asarray(self, values: Any) -> Any:
+        """Values as an array of the simulation's kind; floating-point numbers in its precision."""
+        ...
+
+    def data(self, field: str) -> Any:
         """An ``MjData`` field of all worlds, (n, ...), live: it follows the simulation. Read only."""
         ...
 
-    def model_field(self, field: str) -> np.ndarray:
+    def model_field(self, field: str) -> Any:
         """An ``MjModel`` field of all worlds as ξ has it, (n, ...) or, where no parameter writes it, (1, ...)."""
         ...
 
@@ -41,8 +50,8 @@ class Simulation(Protocol):
         """Put k worlds into a state, (k, nq), (k, nv), at time 0, with ``ctrl`` (k, nu) as the commands so far."""
         ...
 
-    def step(self, ctrl: Array, substeps: int) -> NDArray[np.bool_]:
-        """Hold ``ctrl`` (n, nu) for some steps of the model; return which worlds diverged, (n,).
+    def step(self, ctrl: Any, substeps: int) -> Any:
+        """Hold ``ctrl`` (n, nu) for some steps of the model; return which worlds diverged, (n,) bool.
 
         Positions, what follows from them, and velocities are current afterwards.
         """
@@ -58,7 +67,11 @@ class SingleSimulation:
         self.model = model
         self.mj_data = mujoco.MjData(model)
         self._writer = ModelWriter(model, space)
-        self._history = _CommandHistory(model)
+        self._history = CommandHistory(model)
+
+    def asarray(self, values: ArrayLike) -> np.ndarray:
+        """See :meth:`Simulation.asarray`."""
+        return _asarray(values)
 
     def data(self, field: str) -> np.ndarray:
         """See :meth:`Simulation.data`."""
@@ -119,9 +132,13 @@ class BatchSimulation:
         self.num_worlds = num_worlds
         self._batch = Batch(model, num_worlds, num_threads)
         self._writer = ModelWriter(model, space)
-        self._history = _CommandHistory(model)
+        self._history = CommandHistory(model)
         self._bound: dict[str, np.ndarray] = {}
         self._fields = {name: self._batch.expand(name) for name in self._writer.fields}
+
+    def asarray(self, values: ArrayLike) -> np.ndarray:
+        """See :meth:`Simulation.asarray`."""
+        return _asarray(values)
 
     def data(self, field: str) -> np.ndarray:
         """See :meth:`Simulation.data`."""
@@ -177,7 +194,12 @@ class BatchSimulation:
         return self._batch.warning[:, [int(w) for w in _DIVERGED], 1].sum(axis=1)
 
 
-class _CommandHistory:
+def _asarray(values: ArrayLike) -> np.ndarray:
+    array = np.asarray(values)
+    return array.astype(np.float64, copy=False) if array.dtype.kind == "f" else array
+
+
+class CommandHistory:
     """Fills the buffers of delayed actuators, so that an episode starts as if its first command had always held.
 
     MuJoCo resets them to zero: a servo with a delay would first be driven towards joint position 0.
@@ -193,7 +215,7 @@ class _CommandHistory:
             if n > 0
         ]
 
-    def fill(self, history: np.ndarray, ctrl: Array) -> None:
+    def fill(self, history: Any, ctrl: Any) -> None:
         """Write ``ctrl`` (k, nu) as every past command into ``history`` (k, nhistory), in place."""
         for actuator, start, n in self._slots:
             history[:, start : start + n] = ctrl[:, actuator, None]

@@ -53,7 +53,7 @@ class _FieldPlan:
     nominal: Array  # (m,) the model as compiled
     set_columns: tuple[tuple[NDArray[np.intp], int], ...]  # (positions among the m, parameter)
     scale_columns: tuple[tuple[NDArray[np.intp], int, float, float], ...]  # (positions, parameter, nominal, power)
-    add_columns: tuple[tuple[NDArray[np.intp], int], ...]
+    add_columns: tuple[tuple[NDArray[np.intp], int, float], ...]  # (positions, parameter, factor)
 
     def values(self, xi: Array) -> Array:
         """ξ (n, d) -> the elements (n, m)."""
@@ -62,8 +62,8 @@ class _FieldPlan:
             out[:, at] = xi[:, p, None]
         for at, p, nominal, power in self.scale_columns:
             out[:, at] *= (xi[:, p, None] / nominal) ** power
-        for at, p in self.add_columns:
-            out[:, at] += xi[:, p, None]
+        for at, p, factor in self.add_columns:
+            out[:, at] += factor * xi[:, p, None]
         return out
 
 
@@ -204,6 +204,6 @@ def _plans(model: mujoco.MjModel, space: ParameterSpace) -> Iterator[tuple[str, 
                 nominal=model_field(model, field).ravel()[elements].astype(np.float64),
                 set_columns=tuple(sets),
                 scale_columns=tuple((a, i, p.nominal, w.power) for p, i, w, a in at if w.operation == "scale"),
-                add_columns=tuple((a, i) for _, i, w, a in at if w.operation == "add"),
+                add_columns=tuple((a, i, w.factor) for _, i, w, a in at if w.operation == "add"),
             ),
         )

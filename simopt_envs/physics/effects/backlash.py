@@ -1,0 +1,51 @@
+"""Play in a gear."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from simopt_envs.physics.effects.effect import Effect, Motion, object_name
+from simopt_envs.physics.effects.joints import add_link_joint, dof, outermost_joints, position_unit
+from simopt_envs.physics.parameters import Parameter, Write
+
+_REACH = 1e-5  # rad or m: how far before the end of its range a stop acts
+
+
+class Backlash(Effect):
+    """A link that is loose against the motor of its joint, where the encoder is, by a total width ``play``.
+
+    Between the stops of the joint ``NAME.play``, nothing acts; the stops do not bounce.
+    """
+
+    name = "backlash"
+    law = "|q_link - q_motor| <= p/2"
+
+    def places(self, model: mujoco.MjModel) -> tuple[str, ...]:
+        """See :meth:`Effect.places`."""
+        return outermost_joints(model)
+
+    def add(self, spec: mujoco.MjSpec, place: str) -> None:
+        """See :meth:`Effect.add`."""
+        joint = object_name(place)
+        link = add_link_joint(spec, joint, f"{joint}.play")
+        in_degrees = link.type == mujoco.mjtJoint.mjJNT_HINGE and link.compiler.degree
+        half = _REACH / 2  # so that without play both stops act, and hold the link
+        half = np.degrees(half) if in_degrees else half
+        link.limited = mujoco.mjtLimited.mjLIMITED_TRUE
+        link.range = [-half, half]
+        link.margin = _REACH
+        link.solref_limit = [2 * spec.option.timestep, 1.0]  # as fast as is stable, without a bounce
+        link.solimp_limit = [0.9999, 0.9999, 0.001, 0.5, 2.0]  # and it does not give under load
+
+    def parameters(self, model: mujoco.MjModel, place: str) -> tuple[Parameter, ...]:
+        """See :meth:`Effect.parameters`."""
+        joint = object_name(place)
+        writes = tuple(Write("jnt_range", f"{joint}.play", (i,), "add", factor=f) for i, f in ((0, -0.5), (1, 0.5)))
+        return (Parameter("play", position_unit(model, joint), 0.0, 0.0, 1.0, "linear", writes),)
+
+    def probes(self, model: mujoco.MjModel, place: str, motion: Motion) -> tuple[dict[str, float], ...]:
+        """See :meth:`Effect.probes`."""
+        i = dof(model, object_name(place))
+        travel = float(motion.high[i] - motion.low[i])
+        return tuple({"play": part * travel} for part in (0.005, 0.02))

@@ -1,0 +1,87 @@
+"""A drive that answers no small errors."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from simopt_envs.physics.effects.actuators import DEADBAND, affine_drives, drive_force, driven_joint, gear
+from simopt_envs.physics.effects.effect import Effect, Motion, object_name
+from simopt_envs.physics.effects.joints import position_unit
+from simopt_envs.physics.parameters import Parameter, Write
+
+_SHARED = (
+    *("trntype", "target", "gear", "cranklength", "slidersite", "refsite", "lengthrange", "group"),
+    *("dyntype", "dynprm", "actdim", "actlimited", "actrange", "actearly", "gaintype", "biastype"),
+    *("ctrllimited", "ctrlrange", "inheritrange", "nsample", "interp", "delay"),
+)
+_CLOSED = 1e-12  # a force range must not be empty
+
+
+class Deadband(Effect):
+    """No force while a servo's error, or a motor's command, is within a width; beyond it, the force grows from zero.
+
+    MuJoCo's drives have no dead band, and a law of the commands alone would not do for a servo, whose error is
+    simulated. But a dead zone is what a saturation takes away from a line: dz(e) = e - clip(e, -w, w). So a second
+    actuator, ``NAME.deadband``, pulls against the drive with the same stiffness and a force limit of stiffness times
+    width. It has to get the drive's command (:func:`~simopt_envs.physics.effects.actuators.command_sources`), and what
+    scales or delays the drive must do the same to it (:func:`~simopt_envs.physics.effects.actuators.on_all_parts`).
+    The damping of a position servo stays.
+    """
+
+    name = "deadband"
+    law = "f = k (e - clip(e, -w, w)), e = u - q or u"
+
+    def places(self, model: mujoco.MjModel) -> tuple[str, ...]:
+        """See :meth:`Effect.places`."""
+        return tuple(
+            place
+            for place in affine_drives(model)
+            if model.actuator(object_name(place)).gaintype[0] == int(mujoco.mjtGain.mjGAIN_FIXED)
+        )
+
+    def add(self, spec: mujoco.MjSpec, place: str) -> None:
+        """See :meth:`Effect.add`."""
+        drive = spec.actuator(object_name(place))
+        second = spec.add_actuator(name=drive.name + DEADBAND)
+        for attribute in _SHARED:
+            setattr(second, attribute, getattr(drive, attribute))
+        second.gainprm, second.biasprm = -drive.gainprm, -_error_terms(drive.gainprm, drive.biasprm)
+        second.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
+        second.forcerange = (-_CLOSED, _CLOSED)
+
+    def parameters(self, model: mujoco.MjModel, place: str) -> tuple[Parameter, ...]:
+        """See :meth:`Effect.parameters`."""
+        drive = object_name(place)
+        stiffness = abs(float(model.actuator(drive).gainprm[0]))
+        writes = tuple(
+            Write("actuator_forcerange", drive + DEADBAND, (side,), "add", factor=sign * stiffness)
+            for side, sign in enumerate((-1.0, 1.0))
+        )
+        return (Parameter("width", _unit(model, drive), 0.0, 0.0, 1e6, "linear", writes),)
+
+    def probes(self, model: mujoco.MjModel, place: str, motion: Motion) -> tuple[dict[str, float], ...]:
+        """Parts of the error, or of the command, that makes the drive's force."""
+        drive = object_name(place)
+        stiffness = abs(float(model.actuator(drive).gainprm[0]) * gear(model, drive))
+        error = drive_force(model, drive, motion) / stiffness
+        return ({"width": 0.1 * error}, {"width": 0.5 * error})
+
+
+def _error_terms(gain: np.ndarray, bias: np.ndarray) -> np.ndarray:
+    """The part of a drive's bias that makes an error of its command: the position's, or a velocity servo's."""
+    terms = np.zeros_like(bias)
+    terms[1] = bias[1]
+    if bias[1] == 0 and bias[2] == -gain[0]:
+        terms[2] = bias[2]
+    return terms
+
+
+def _unit(model: mujoco.MjModel, drive: str) -> str:
+    """Of a servo's error; of a motor's command it is not known."""
+    joint = driven_joint(model, drive)
+    gain, bias = model.actuator(drive).gainprm, model.actuator(drive).biasprm
+    position, velocity = _error_terms(gain, bias)[1:3] != 0
+    if joint is None or not (position or velocity):
+        return ""
+    return position_unit(model, joint) + ("/s" if velocity else "")

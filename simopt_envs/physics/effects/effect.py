@@ -1,0 +1,82 @@
+"""What a physical effect is: a law that a model may lack, the places where it can act, and how it enters a model."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+import mujoco
+
+from simopt_envs.physics.parameters import Array, Parameter
+
+Values = Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Motion:
+    """How a system moved in its recordings: it sets the size at which an effect is first tried.
+
+    Attributes:
+        low, high: range of each degree of freedom [rad, m], (nv,).
+        speed: root mean square of its velocity [rad/s, m/s], (nv,).
+        force: root mean square of the generalised force that moves it [N m, N], (nv,).
+        command: root mean square of each actuator's command, less its mean, (nu,).
+    """
+
+    low: Array
+    high: Array
+    speed: Array
+    force: Array
+    command: Array
+
+
+class Effect(ABC):
+    """A physical effect. One subclass per effect, one file per subclass; a new file in this folder is all it takes.
+
+    An effect enters a model in two steps. :meth:`add` gives an ``MjSpec`` the structure that the effect needs, if any,
+    and :meth:`parameters` says which fields of the compiled model hold its numbers. At the parameters' nominal values
+    the model behaves as it did without the effect.
+
+    Attributes:
+        name: as in reports and in ``gap.json``.
+        law: one line, as a person would write it.
+    """
+
+    name: ClassVar[str]
+    law: ClassVar[str]
+
+    @abstractmethod
+    def places(self, model: mujoco.MjModel) -> tuple[str, ...]:
+        """Where it can act, ``"joint:elbow"``: kind of object, colon, name."""
+
+    def add(self, spec: mujoco.MjSpec, place: str) -> None:  # noqa: B027 - most effects need no structure
+        """Give the spec what the effect needs, in place; nothing where MuJoCo's fields suffice.
+
+        Joints, actuators, sites and sensors of the spec keep their names, since recordings are columns of them.
+        """
+
+    @abstractmethod
+    def parameters(self, model: mujoco.MjModel, place: str) -> tuple[Parameter, ...]:
+        """Its parameters at a place; ``model`` has the effect's structure. Nominal is what leaves the model as it was.
+
+        Writes add to, or scale, what the model has: plain parameters move the same fields. A write to
+        ``column.bias``, ``column.scale`` or ``column.delay`` of a column changes what a sensor shows, see
+        :mod:`simopt_envs.physics.columns`.
+        """
+
+    @abstractmethod
+    def probes(self, model: mujoco.MjModel, place: str, motion: Motion) -> tuple[dict[str, float], ...]:
+        """Values at which to try the effect first: sizes that would just show, one for each shape it may have.
+
+        ``model`` is the one that ``motion`` is of, without the effect's structure.
+
+        A probe and a multiple of it are told apart by the fit; what a multiple cannot make (another width of a detent)
+        needs a probe of its own. Every parameter has a size in at least one probe that differs from its nominal.
+        """
+
+
+def object_name(place: str) -> str:
+    """``"joint:elbow"`` -> ``"elbow"``."""
+    return place.split(":", 1)[1]

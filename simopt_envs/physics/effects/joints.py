@@ -1,0 +1,129 @@
+"""What the effects of joints share: which joints there are, their units, and what is put on or behind them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from simopt_envs.physics.effects.effect import Motion, object_name
+
+_LEAST_ROTOR = 0.1  # of the inertia along a joint that belongs to its motor, at least
+_LEAST_STAGE = 1e-3  # and to every joint behind it, so that the mass matrix is regular
+_SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+
+
+def scalar_joints(model: mujoco.MjModel) -> tuple[str, ...]:
+    """``"joint:NAME"`` of every named hinge and slide."""
+    names = (model.joint(i).name for i in range(model.njnt) if model.jnt_type[i] in _SCALAR)
+    return tuple(f"joint:{name}" for name in names if name)
+
+
+def dof(model: mujoco.MjModel, joint: str) -> int:
+    """The degree of freedom of a hinge or slide."""
+    return int(model.jnt_dofadr[model.joint(joint).id])
+
+
+def is_slide(model: mujoco.MjModel, joint: str) -> bool:
+    """Whether a joint slides."""
+    return bool(model.joint(joint).type[0] == int(mujoco.mjtJoint.mjJNT_SLIDE))
+
+
+def force_unit(model: mujoco.MjModel, joint: str) -> str:
+    """N or N m."""
+    return "N" if is_slide(model, joint) else "N m"
+
+
+def position_unit(model: mujoco.MjModel, joint: str) -> str:
+    """Metres or radians, as m or rad."""
+    return "m" if is_slide(model, joint) else "rad"
+
+
+def speed_unit(model: mujoco.MjModel, joint: str) -> str:
+    """m/s or rad/s."""
+    return "m/s" if is_slide(model, joint) else "rad/s"
+
+
+def damping_unit(model: mujoco.MjModel, joint: str) -> str:
+    """N s/m or N m s/rad."""
+    return "N s/m" if is_slide(model, joint) else "N m s/rad"
+
+
+def stiffness_unit(model: mujoco.MjModel, joint: str) -> str:
+    """N/m or N m/rad."""
+    return "N/m" if is_slide(model, joint) else "N m/rad"
+
+
+def inertia_unit(model: mujoco.MjModel, joint: str) -> str:
+    """Kilograms or kilogram square metres, as kg or kg m2."""
+    return "kg" if is_slide(model, joint) else "kg m2"
+
+
+def reference(model: mujoco.MjModel, joint: str) -> float:
+    """Where the joint is in the model's reference pose [rad, m]."""
+    return float(model.qpos0[model.jnt_qposadr[model.joint(joint).id]])
+
+
+def probe_force(model: mujoco.MjModel, joint: str, motion: Motion) -> float:
+    """A force along the joint that would just show in the recordings [N m, N]: a twentieth of what moves it."""
+    return 0.05 * float(motion.force[dof(model, joint)])
+
+
+def blank() -> Any:
+    """Defaults of no model: what is added to one must not inherit the damping, gears or limits of its classes."""
+    return mujoco.MjSpec().default
+
+
+def add_fixed_tendon(spec: mujoco.MjSpec, name: str, *joints: str) -> Any:
+    """A tendon whose length is the sum of the joints' positions."""
+    tendon = spec.add_tendon(blank(), name=name)
+    for joint in joints:
+        tendon.wrap_joint(joint, 1.0)
+    return tendon
+
+
+def add_passive_motor(spec: mujoco.MjSpec, name: str, joint: str, lugre: Sequence[float] = (0.0,) * 5) -> Any:
+    """A motor without windings or command: its ``biasprm`` are cogging (A, n, phase), then friction (Fc, Fs, vs).
+
+    It comes after the model's own actuators and takes no control. What it does counts towards the joint's
+    ``actuatorfrcrange``, if there is one.
+
+    Args:
+        spec: changed in place.
+        name: of the new actuator.
+        joint: that it acts on.
+        lugre: bristle stiffness and damping, Fc, Fs and vs of LuGre friction (Canudas de Wit et al. 1995), if any.
+    """
+    motor = spec.add_actuator(blank(), name=name, trntype=mujoco.mjtTrn.mjTRN_JOINT, target=joint)
+    motor.set_to_dcmotor([0.0, 0.0], 1.0, lugre=list(lugre), ctrlspec=int(mujoco.mjtCtrlInput.mjINPUT_NONE))
+    return motor
+
+
+def inertia(spec: mujoco.MjSpec, joint: str) -> float:
+    """Inertia along the joint in the model's reference pose [kg m2, kg]."""
+    model = spec.copy().compile()
+    return float(model.dof_M0[dof(model, joint)])
+
+
+def outermost_joints(model: mujoco.MjModel) -> tuple[str, ...]:
+    """``"joint:NAME"`` of the hinges and slides that a coaxial joint can be put behind: the last of their bodies."""
+    last = {int(adr + num) - 1 for adr, num in zip(model.body_jntadr, model.body_jntnum, strict=True) if num}
+    return tuple(place for place in scalar_joints(model) if model.joint(object_name(place)).id in last)
+
+
+def add_link_joint(spec: mujoco.MjSpec, joint: str, name: str) -> Any:
+    """A joint on the axis of another, which is then the motor and its encoder; the link is where their sum is.
+
+    A motor without inertia would be thrown about by the smallest force between it and the link, so where the model
+    gives it (almost) none, the new joint has some: it counts only while motor and link move against each other.
+    """
+    motor, total = spec.joint(joint), inertia(spec, joint)
+    link = motor.parent.add_joint(blank(), name=name, type=motor.type, pos=motor.pos, axis=motor.axis)
+    link.armature = max(_LEAST_ROTOR * total - motor.armature, _LEAST_STAGE * total)
+    if motor.type == mujoco.mjtJoint.mjJNT_SLIDE:
+        # Without effect on a slide, except that MuJoCo no longer takes the mass matrix of its body for diagonal, as it
+        # does for slides along its axes.
+        link.pos = np.add(motor.pos, 1.0)
+    return link

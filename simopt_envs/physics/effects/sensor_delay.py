@@ -1,0 +1,30 @@
+"""A sensor that shows the past."""
+
+from __future__ import annotations
+
+import mujoco
+
+from simopt_envs.physics.effects.effect import Effect, Motion
+from simopt_envs.physics.effects.joints import scalar_joints
+from simopt_envs.physics.effects.readings import columns, sensors, sites
+from simopt_envs.physics.parameters import Parameter, Write
+
+
+class SensorDelay(Effect):
+    """What is recorded is late; a servo reads its own encoder without the delay."""
+
+    name = "sensor_delay"
+    law = "y(t) = x(t - T)"
+
+    def places(self, model: mujoco.MjModel) -> tuple[str, ...]:
+        """See :meth:`Effect.places`."""
+        return scalar_joints(model) + sensors(model) + sites(model)
+
+    def parameters(self, model: mujoco.MjModel, place: str) -> tuple[Parameter, ...]:
+        """See :meth:`Effect.parameters`."""
+        writes = tuple(Write("column.delay", column, operation="add") for column in columns(model, place))
+        return (Parameter("delay", "s", 0.0, 0.0, 0.2, "linear", writes),)
+
+    def probes(self, model: mujoco.MjModel, place: str, motion: Motion) -> tuple[dict[str, float], ...]:
+        """See :meth:`Effect.probes`."""
+        return ({"delay": 0.005},)

@@ -1,0 +1,424 @@
+"""Effects of joints: neutral is the plain model, the law is the formula's, worlds of a batch do as single models."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import mujoco
+import numpy as np
+import pytest
+from mujoco.batch import Batch
+
+from simopt_envs.physics import ModelWriter, ParameterSpace
+from simopt_envs.physics.effects import EFFECTS, Motion
+from simopt_envs.physics.spec_writer import write_spec
+
+# The classes' defaults are a trap: nothing that an effect adds may inherit them.
+ARM = """
+<mujoco>
+  <compiler angle="degree"/>
+  <option timestep="0.002" integrator="implicitfast"/>
+  <default>
+    <joint damping="0.1" armature="0.02"/>
+    <tendon damping="3" frictionloss="2" limited="true" range="-0.01 0.01"/>
+    <general gear="2" forcerange="-30 30"/>
+  </default>
+  <worldbody>
+    <body name="upper">
+      <joint name="shoulder" type="hinge" axis="0 1 0"/>
+      <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.02"/>
+      <body name="fore" pos="0.3 0 0">
+        <joint name="elbow" type="hinge" axis="0 1 0" ref="10" springref="20"/>
+        <geom type="capsule" fromto="0 0 0 0.25 0 0" size="0.02"/>
+        <site name="tip" pos="0.25 0 0"/>
+      </body>
+    </body>
+    <body name="carriage" pos="0 1 0">
+      <joint name="drive" type="slide" axis="1 0 0" damping="5"/>
+      <geom type="box" size="0.1 0.1 0.1" mass="2"/>
+    </body>
+  </worldbody>
+  <actuator>
+    <position joint="shoulder" kp="60" kv="4"/>
+    <position joint="elbow" kp="40" kv="2"/>
+    <motor joint="drive"/>
+  </actuator>
+</mujoco>
+"""
+STEPS, TIMESTEP = 1000, 0.002
+MOTION = Motion(*(np.array(row) for row in ([-0.8] * 3, [0.8] * 3, [1.5] * 3, [4.0] * 3, [0.5] * 3)))
+
+# place, values, and whether recordings of the neutral structure are the plain model's to this [rad, m]
+CASES: dict[str, tuple[str, dict[str, float], float]] = {
+    "armature": ("joint:elbow", {"armature": 0.03}, 0.0),
+    "asymmetric_friction": ("joint:drive", {"frictionloss": 4.0, "difference": 3.0}, 1e-12),
+    "backlash": ("joint:elbow", {"play": 0.02}, 3e-4),
+    "cogging": ("joint:elbow", {"amplitude": 0.6, "periods": 7.0, "phase": 0.4}, 1e-12),
+    "detent": ("joint:elbow", {"force": 0.8, "width": 0.2, "position": 0.1}, 1e-8),
+    "joint_coupling": ("joint:shoulder+elbow", {"stiffness": 5.0}, 1e-12),
+    "joint_elasticity": ("joint:elbow", {"stiffness": 60.0}, 5e-7),
+    "joint_spring": ("joint:elbow", {"stiffness": 6.0, "reference": 0.5}, 1e-12),
+    "load_dependent_friction": ("joint:drive", {"coefficient": 0.15}, 1e-3),
+    "quadratic_drag": ("joint:drive", {"drag": 8.0}, 1e-12),
+    "stribeck_friction": ("joint:drive", {"frictionloss": 2.0, "breakaway": 4.0, "velocity": 0.2}, 1e-9),
+}
+
+
+def structure(name: str, place: str, arm: str = ARM) -> tuple[mujoco.MjModel, ParameterSpace]:
+    """The arm with an effect's structure, and its parameters."""
+    spec = mujoco.MjSpec.from_string(arm)
+    EFFECTS[name].add(spec, place)
+    model = spec.compile()
+    return model, ParameterSpace(EFFECTS[name].parameters(model, place))
+
+
+def with_effect(name: str, place: str, values: Mapping[str, float] | None = None, arm: str = ARM) -> mujoco.MjModel:
+    """The arm with an effect at some values, its neutral ones by default."""
+    model, space = structure(name, place, arm)
+    ModelWriter(model, space).write_model(space.values(dict(values or {})), model, mujoco.MjData(model))
+    return model
+
+
+def commands() -> np.ndarray:
+    """(STEPS, 3): both servos swing, the drive pushes to and fro."""
+    t = TIMESTEP * np.arange(STEPS)[:, None]
+    return np.array([0.6, 0.5, 6.0]) * np.sin(np.array([3.0, 5.0, 4.0]) * t)
+
+
+def rollout(model: mujoco.MjModel) -> np.ndarray:
+    """Positions of the three joints and the tip's height, (STEPS, 4)."""
+    data, rows = mujoco.MjData(model), []
+    joints = [model.joint(name).qposadr[0] for name in ("shoulder", "elbow", "drive")]
+    for command in commands():
+        data.ctrl[:] = command
+        mujoco.mj_step(model, data)
+        rows.append([*data.qpos[joints], data.site("tip").xpos[2]])
+    return np.array(rows)
+
+
+@pytest.fixture(scope="module")
+def plain() -> np.ndarray:
+    """The rollout of the arm as given."""
+    return rollout(mujoco.MjModel.from_xml_string(ARM))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_neutral_is_the_plain_model_and_the_effect_is_not(name: str, plain: np.ndarray) -> None:
+    place, values, tolerance = CASES[name]
+    assert np.abs(rollout(with_effect(name, place)) - plain).max() <= tolerance
+    assert np.abs(rollout(with_effect(name, place, values)) - plain).max() > 2e-3
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_no_command_is_added(name: str) -> None:
+    model, _ = structure(name, CASES[name][0])
+    assert model.nu == 3
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_repaired_spec_can_be_saved(name: str) -> None:
+    place, values, _ = CASES[name]
+    spec = mujoco.MjSpec.from_string(ARM)
+    EFFECTS[name].add(spec, place)
+    model = spec.compile()
+    space = ParameterSpace(EFFECTS[name].parameters(model, place))
+    write_spec(spec, model, space, space.values(values))
+    expected = rollout(with_effect(name, place, values))[:200]
+    assert rollout(spec.compile())[:200] == pytest.approx(expected, abs=1e-9)
+    saved = mujoco.MjModel.from_xml_string(spec.to_xml())  # six digits
+    assert rollout(saved)[:200] == pytest.approx(expected, abs=2e-3)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_worlds_of_a_batch_do_as_single_models(name: str) -> None:
+    place, values, _ = CASES[name]
+    model, space = structure(name, place)
+    xi = space.values({key: np.array([value, 0.7 * value]) for key, value in values.items()}, num_worlds=2)
+    batch, writer = Batch(model, 2, 1), ModelWriter(model, space)
+    fields = {field: batch.expand(field) for field in writer.fields}
+    writer.write(xi, fields.__getitem__)
+    if writer.needs_set_const:
+        batch.set_const(np.arange(2))
+    batch.reset()
+    records = batch.rollout(
+        STEPS,
+        control=np.tile(commands(), (2, 1, 1)),
+        control_spec=int(mujoco.mjtState.mjSTATE_CTRL),
+        record=["qpos"],
+        ids=np.arange(2),
+    )
+    joints = [model.joint(joint).qposadr[0] for joint in ("shoulder", "elbow", "drive")]
+    ends = records["qpos"][:, -1, joints]
+    for world in range(2):
+        single = rollout(with_effect(name, place, space.as_dict(xi[world])))
+        assert ends[world] == pytest.approx(single[-1, :3], abs=1e-12)
+    assert np.abs(ends[0] - ends[1]).max() > 1e-6
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_probes_are_within_bounds_and_move_every_parameter(name: str) -> None:
+    place, _, _ = CASES[name]
+    model, space = structure(name, place)
+    probes = np.array([space.values(probe) for probe in EFFECTS[name].probes(model, place, MOTION)])
+    assert (probes != space.nominal).any(axis=0).all()
+
+
+def test_places() -> None:
+    model = mujoco.MjModel.from_xml_string(ARM)
+    assert EFFECTS["cogging"].places(model) == ("joint:shoulder", "joint:elbow", "joint:drive")
+    assert EFFECTS["joint_coupling"].places(model) == ("joint:shoulder+elbow",)
+    explicit = mujoco.MjModel.from_xml_string(ARM.replace("implicitfast", "RK4"))
+    assert EFFECTS["joint_elasticity"].places(model) == ("joint:shoulder", "joint:elbow", "joint:drive")
+    assert EFFECTS["joint_elasticity"].places(explicit) == ()
+
+
+# Laws: the force that an effect adds at states, as the difference of two inverse dynamics.
+
+
+def added_force(name: str, place: str, values: Mapping[str, float], q: float, v: float) -> np.ndarray:
+    """What an effect adds to the smooth forces on shoulder, elbow and drive, all at a position and speed."""
+    forces = []
+    for model in (with_effect(name, place, values), mujoco.MjModel.from_xml_string(ARM)):
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:] = q, v
+        mujoco.mj_forward(model, data)
+        forces.append(data.qfrc_smooth.copy())
+    return forces[0] - forces[1]
+
+
+def triangle(x: float, force: float, width: float) -> float:
+    return -force * np.sign(x) * max(0.0, 1 - abs(2 * abs(x) / width - 1))
+
+
+LAWS: dict[str, tuple[str, dict[str, float], Callable[[float, float], list[float]]]] = {
+    "cogging": (
+        "joint:elbow",
+        {"amplitude": 0.6, "periods": 7.0, "phase": 0.4},
+        lambda q, v: [0, 0.6 * np.sin(7 * q + 0.4), 0],
+    ),
+    "detent": (
+        "joint:elbow",
+        {"force": 0.8, "width": 0.4, "position": 0.1},
+        lambda q, v: [0, triangle(q - 0.1, 0.8, 0.4), 0],
+    ),
+    "joint_coupling": (
+        "joint:shoulder+elbow",
+        {"stiffness": 5.0},
+        lambda q, v: [-5 * (2 * q - np.radians(10)), -5 * (2 * q - np.radians(10)), 0],
+    ),
+    "joint_spring": (
+        "joint:drive",
+        {"stiffness": 6.0, "reference": -0.3},
+        lambda q, v: [0, 0, -6 * (q + 0.3)],
+    ),
+    "quadratic_drag": ("joint:elbow", {"drag": 0.8}, lambda q, v: [0, -0.8 * abs(v) * v, 0]),
+}
+
+
+@pytest.mark.parametrize("name", LAWS)
+@pytest.mark.parametrize(("q", "v"), [(0.0, 0.0), (0.15, 1.3), (0.27, -0.4), (-0.06, 2.0), (0.9, -3.0)])
+def test_the_force_is_the_law(name: str, q: float, v: float) -> None:
+    place, values, law = LAWS[name]
+    assert added_force(name, place, values, q, v) == pytest.approx(law(q, v), abs=1e-7)
+
+
+def test_armature_adds_to_the_inertia() -> None:
+    light, heavy = (with_effect("armature", "joint:elbow", {"armature": extra}) for extra in (0.0, 0.03))
+    assert heavy.dof_M0 - light.dof_M0 == pytest.approx([0, 0.03, 0], abs=1e-12)
+
+
+# Friction is felt by its motion: the drive alone, m dv/dt = u - d v + f(v), integrated by other means.
+
+
+def drive_velocity(name: str, values: Mapping[str, float], push: Callable[[float], float], start: float) -> np.ndarray:
+    """Speed of the drive [m/s], (STEPS,)."""
+    model = with_effect(name, "joint:drive", values)
+    data, speeds = mujoco.MjData(model), []
+    dof = model.joint("drive").dofadr[0]
+    data.qvel[dof] = start
+    for i in range(STEPS):
+        data.ctrl[2] = push(i * TIMESTEP) / 2  # the class's gear
+        mujoco.mj_step(model, data)
+        speeds.append(data.qvel[dof])
+    return np.array(speeds)
+
+
+def integrated(friction: Callable[[float], float], push: Callable[[float], float], start: float) -> np.ndarray:
+    """The same by Euler steps of a twentieth of the timestep; ``friction`` is at a speed > 0, which it must stay."""
+    v, speeds, fine = start, [], TIMESTEP / 20
+    for i in range(20 * STEPS):
+        v += fine * (push(i // 20 * TIMESTEP) - 5 * v + friction(v)) / 2.0
+        speeds.append(v)
+    return np.array(speeds[19::20])
+
+
+@pytest.mark.parametrize("difference", [3.0, -3.0])
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+def test_asymmetric_friction_slows_one_direction_more(difference: float, direction: float) -> None:
+    def push(t: float) -> float:
+        return direction * (9.0 + 2.0 * np.sin(5 * t))
+
+    moved = direction * drive_velocity(
+        "asymmetric_friction", {"frictionloss": 4.0, "difference": difference}, push, 0.5 * direction
+    )
+    expected = integrated(lambda v: -(4.0 + direction * difference / 2), lambda t: direction * push(t), 0.5)
+    assert expected.min() > 0.1
+    assert moved == pytest.approx(expected, abs=0.01)
+
+
+@pytest.mark.parametrize(("push", "sticks"), [(5.0, True), (2.0, True), (6.0, False), (-2.0, True), (-3.5, False)])
+def test_asymmetric_friction_holds_at_rest(push: float, sticks: bool) -> None:
+    speed = drive_velocity("asymmetric_friction", {"frictionloss": 4.0, "difference": 3.0}, lambda t: push, 0.0)
+    assert (abs(speed[-1]) < 2e-3) == sticks
+    assert sticks or np.sign(speed[-1]) == np.sign(push)
+
+
+def test_stribeck_friction_has_its_peak_at_low_speed() -> None:
+    def push(t: float) -> float:
+        return 8.0 - 5.0 * t
+
+    values = {"frictionloss": 2.0, "breakaway": 4.0, "velocity": 0.2}
+    moved = drive_velocity("stribeck_friction", values, push, 1.0)
+    expected = integrated(lambda v: -(2 + 4 * np.exp(-((v / 0.2) ** 2))), push, 1.0)
+    moving = np.cumprod(expected > 0.05).astype(bool)
+    assert STEPS / 2 < moving.sum() < STEPS
+    coulomb = integrated(lambda v: -2.0, push, 1.0)
+    assert np.abs(coulomb - expected)[moving].max() > 0.1
+    assert moved[moving] == pytest.approx(expected[moving], abs=0.025)
+
+
+@pytest.mark.parametrize(("push", "sticks"), [(5.5, True), (3.0, True), (6.6, False)])
+def test_stribeck_friction_holds_up_to_its_peak(push: float, sticks: bool) -> None:
+    values = {"frictionloss": 2.0, "breakaway": 4.0, "velocity": 0.2}
+    speed = drive_velocity("stribeck_friction", values, lambda t: push * min(1.0, 2 * t), 0.0)
+    assert (abs(speed[-1]) < 5e-3) == sticks
+
+
+LOADED = """
+<mujoco>
+  <option timestep="0.002" integrator="implicitfast"/>
+  <worldbody>
+    <body pos="0.1 0.2 0.3" euler="0 0 40">
+      <body name="arm" pos="0.1 0 0" euler="10 0 50">
+        <joint name="hinge" type="hinge" axis="0 1 0" pos="-0.1 0 0" armature="0.02"/>
+        <geom type="box" size="0.1 0.02 0.02" mass="0.5"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor joint="hinge"/>
+  </actuator>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize("coefficient", [0.05, 0.1])
+def test_load_dependent_friction_is_that_of_the_transmitted_torque(coefficient: float) -> None:
+    """A pendulum that a motor swings, by a torque: what passes the gear carries the link, I dv/dt = T + gravity."""
+    place, rotor = "joint:hinge", 0.02
+    plain = mujoco.MjModel.from_xml_string(LOADED)
+    link = plain.dof_M0[0] - rotor
+    data = mujoco.MjData(plain)
+
+    def gravity(q: float) -> float:
+        data.qpos[:], data.qvel[:] = q, 0.0
+        mujoco.mj_fwdPosition(plain, data)
+        mujoco.mj_fwdVelocity(plain, data)
+        return -float(data.qfrc_bias[0])
+
+    def swing(model: mujoco.MjModel) -> np.ndarray:
+        state, out = mujoco.MjData(model), []
+        for i in range(500):
+            state.ctrl[0] = push(i)
+            mujoco.mj_step(model, state)
+            out.append(state.qpos[0])
+        return np.array(out)
+
+    def push(i: int) -> float:
+        return 1.0 * np.cos(5 * i * TIMESTEP)
+
+    def law(mu: float) -> np.ndarray:
+        q, v, out, fine = 0.0, 0.0, [], TIMESTEP / 10
+        for i in range(5000):
+            weight, torque = gravity(q), 0.0
+            for _ in range(3):  # friction depends on what it changes
+                dv = (push(i // 10) + weight - mu * abs(torque) * np.sign(v)) / (link + rotor)
+                torque = link * dv - weight
+            v += fine * dv
+            q += fine * v
+            out.append(q)
+        return np.array(out[9::10])
+
+    effect = law(coefficient) - law(0.0)
+    found = swing(with_effect("load_dependent_friction", place, {"coefficient": coefficient}, LOADED)) - swing(plain)
+    assert np.abs(effect).max() > 0.02
+    assert found == pytest.approx(effect, abs=0.2 * np.abs(effect).max())  # at 13 rad/s
+    assert found @ effect == pytest.approx(effect @ effect, rel=2 * coefficient)
+
+
+# A joint behind the motor's: the motor is what is read, the link is what moves.
+
+# The drive with a rotor of 0.5 kg and a link of 2 kg, free to fly.
+FREE_DRIVE = ARM.replace('axis="1 0 0" damping="5"', 'axis="1 0 0" damping="0" armature="0.5"')
+
+
+def test_elasticity_gives_by_the_load_over_the_stiffness() -> None:
+    model = with_effect("joint_elasticity", "joint:elbow", {"stiffness": 60.0})
+    data = mujoco.MjData(model)
+    elbow, link = (model.joint(name).qposadr[0] for name in ("elbow", "elbow.link"))
+    for _ in range(4 * STEPS):
+        mujoco.mj_step(model, data)
+    weight = -data.qfrc_bias[model.joint("elbow").dofadr[0]]
+    assert abs(weight) > 0.3
+    assert data.qpos[link] == pytest.approx(weight / 60, rel=1e-3)
+    assert abs(data.qpos[link]) > 5e-3
+    expected = -0.3 * np.sin(data.qpos[0]) - 0.25 * np.sin(
+        data.qpos[0] + data.qpos[elbow] + data.qpos[link] - np.radians(10)
+    )
+    assert data.site("tip").xpos[2] == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize("stiffness", [1e2, 1e4])
+def test_elastic_link_swings_as_two_masses_do(stiffness: float) -> None:
+    model = with_effect("joint_elasticity", "joint:drive", {"stiffness": stiffness}, FREE_DRIVE)
+    model.opt.timestep = 1e-4
+    model.dof_damping[model.joint("drive.link").dofadr[0]] *= 0.05  # as fits the timestep
+    data = mujoco.MjData(model)
+    dof, adr = model.joint("drive.link").dofadr[0], model.joint("drive.link").qposadr[0]
+    data.qpos[adr] = 1e-3
+    stretch = []
+    for _ in range(8000):
+        mujoco.mj_step(model, data)
+        stretch.append(data.qpos[adr])
+    crossings = np.flatnonzero(np.diff(np.sign(stretch)))
+    half_period = np.diff(crossings).mean() * 1e-4
+    assert dof == model.nv - 1
+    assert half_period == pytest.approx(np.pi / np.sqrt(stiffness * (1 / 0.5 + 1 / 2.0)), rel=5e-3)
+
+
+def test_backlash_link_rests_on_a_stop_and_is_loose_between() -> None:
+    play = 0.02
+    model = with_effect("backlash", "joint:drive", {"play": play}, FREE_DRIVE)
+    data = mujoco.MjData(model)
+    motor, link = (model.joint(name).id for name in ("drive", "drive.play"))
+    positions = []
+    for i in range(STEPS):
+        data.ctrl[2] = 3.0 * np.sign(np.sin(6 * i * TIMESTEP))
+        mujoco.mj_step(model, data)
+        positions.append(data.qpos[[model.jnt_qposadr[motor], model.jnt_qposadr[link]]].copy())
+    behind = np.array(positions)[:, 1]
+    assert np.abs(behind).max() == pytest.approx(play / 2, abs=1e-3)
+    assert behind.max() > 0.009
+    assert behind.min() < -0.009
+    data = mujoco.MjData(model)
+    data.qvel[model.jnt_dofadr[link]] = 0.01  # in the gap, the motor does not feel the link
+    mujoco.mj_step(model, data, 100)
+    assert data.qvel[model.jnt_dofadr[motor]] == pytest.approx(0.0, abs=1e-6)
+    assert data.qpos[model.jnt_qposadr[link]] == pytest.approx(0.002, rel=1e-3)
+
+
+def test_elasticity_and_backlash_can_be_in_series() -> None:
+    spec = mujoco.MjSpec.from_string(ARM)
+    for name in ("joint_elasticity", "backlash"):
+        EFFECTS[name].add(spec, "joint:elbow")
+    assert spec.compile().nv == 5
