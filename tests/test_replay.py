@@ -122,7 +122,7 @@ def test_a_whole_recording_is_repeated_to_the_last_bit_but_rounding(engine):
     recording, qpos, qvel = record(model)
     windows = cut_windows(model, recording)
     starts = exact_starts(windows, qpos, qvel)
-    simulated = engine(model, ParameterSpace(()), windows, 1).run(np.zeros((1, 0)), starts)[0]
+    simulated = engine(model, ParameterSpace(()), windows, 1).run(np.zeros((1, 0)), starts, windows.commands)[0]
     # The recording began with an empty delay and a filter at zero, a window with settled ones: the same at its start,
     # where the commands were 0 and 0.
     assert windows.names[:2] == ("qpos/slide", "qvel/slide")
@@ -137,10 +137,10 @@ def test_delayed_commands_of_before_a_window_still_act_in_it(engine):
     windows = cut_windows(model, recording, 0.1)
     starts = exact_starts(windows, qpos, qvel)
     run = engine(model, ParameterSpace(()), windows, 1).run
-    np.testing.assert_allclose(run(np.zeros((1, 0)), starts)[0], windows.measured, atol=1e-9)
+    np.testing.assert_allclose(run(np.zeros((1, 0)), starts, windows.commands)[0], windows.measured, atol=1e-9)
     forgotten = replace(windows, past_commands=0 * windows.past_commands)
     run = engine(model, ParameterSpace(()), forgotten, 1).run
-    assert np.abs(run(np.zeros((1, 0)), starts)[0] - windows.measured)[..., :4].max() > 1e-3
+    assert np.abs(run(np.zeros((1, 0)), starts, windows.commands)[0] - windows.measured)[..., :4].max() > 1e-3
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -156,7 +156,7 @@ def test_many_parameter_vectors_at_once_are_each_as_alone(engine):
     windows = cut_windows(model, recording, 0.2)
     xi = np.array([[1.0, 0.3], [5.0, 0.3], [1.0, 0.6]])
     starts = windows.starts.select(np.tile(np.arange(len(windows)), len(xi)))
-    together = engine(model, space, windows, 2).run(xi, starts)
+    together = engine(model, space, windows, 2).run(xi, starts, np.tile(windows.commands, (len(xi), 1, 1)))
     assert together.shape == (3, len(windows), 101, len(windows.channels))
     for row, predicted in zip(xi, together, strict=True):
         alone = cart()

@@ -34,8 +34,14 @@ class BatchEngine:
         self._batch = Batch(self._model, num_xi * len(self._windows), self._num_threads)
         self._fields = {name: self._batch.expand(name) for name in self._writer.fields}
 
-    def run(self, xi: Array, starts: States) -> Array:
-        """The windows' channels (n, w, S, c) for ξ (n, d) from n w starts; NaN from where a world diverged."""
+    def run(self, xi: Array, starts: States, commands: Array) -> Array:
+        """The windows' channels (n, w, S, c); NaN from where a world diverged.
+
+        Args:
+            xi: (n, d).
+            starts: n w states.
+            commands: (n w, N, nu).
+        """
         windows, num_windows = self._windows, len(self._windows)
         if len(xi) * num_windows > self._batch.nsim:
             self._grow(len(xi))
@@ -47,11 +53,11 @@ class BatchEngine:
         for field, values in _initial_fields(self._model, windows, starts).items():
             batch.bind(field)[worlds] = values
         # One step more than the window is long: derived fields lag the state by a step.
-        commands = np.concatenate([windows.commands, windows.commands[:, -1:]], axis=1)
+        commands = np.concatenate([commands, commands[:, -1:]], axis=1)
         fields = list(field_sizes(self._model, windows.channels))
         records = batch.rollout(
             commands.shape[1],
-            control=np.tile(commands, (len(xi), 1, 1)) if self._model.nu else None,
+            control=commands if self._model.nu else None,
             control_spec=int(mujoco.mjtState.mjSTATE_CTRL),
             record=[*fields, mujoco.mjtState.mjSTATE_TIME],
             ids=worlds,
@@ -77,7 +83,7 @@ class RolloutEngine:
         self._writer = ModelWriter(model, space)
         self._data = [mujoco.MjData(model) for _ in range(num_threads or os.cpu_count() or 1)]
 
-    def run(self, xi: Array, starts: States) -> Array:
+    def run(self, xi: Array, starts: States, commands: Array) -> Array:
         """See :meth:`BatchEngine.run`."""
         from mujoco import rollout
 
@@ -86,12 +92,12 @@ class RolloutEngine:
         for values, world in zip(xi, models, strict=True):
             self._writer.write_model(values, world, self._data[0])
         initial = _initial_states(model, windows, starts)
-        commands = np.concatenate([windows.commands, windows.commands[:, -1:]], axis=1)
+        commands = np.concatenate([commands, commands[:, -1:]], axis=1)
         states, sensors = rollout.rollout(
             [world for world in models for _ in range(len(windows))],
             self._data,
             initial,
-            np.tile(commands, (len(xi), 1, 1)) if model.nu else None,
+            commands if model.nu else None,
             nstep=commands.shape[1],
         )
         clock = states[..., 0]
@@ -142,12 +148,12 @@ def _initial_fields(model: mujoco.MjModel, windows: Windows, starts: States) -> 
     for i in range(len(starts)):
         mujoco.mj_resetData(model, data)
         data.qpos[:], data.qvel[:] = starts.qpos[i], starts.qvel[i]
-        _settle_actuators(model, data, windows.past_commands[i % len(windows)])
+        settle_actuators(model, data, windows.past_commands[i % len(windows)])
         act[i], history[i] = data.act, data.history
     return fields | ({"act": act} if model.na else {}) | ({"history": history} if model.nhistory else {})
 
 
-def _settle_actuators(model: mujoco.MjModel, data: mujoco.MjData, past: Array) -> None:
+def settle_actuators(model: mujoco.MjModel, data: mujoco.MjData, past: Array) -> None:
     """Fill activations and delays as the commands before the start (P, nu), P >= 1, left them.
 
     A filter has settled on the last command, and an integrated setpoint is where the joint is.

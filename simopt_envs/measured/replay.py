@@ -6,6 +6,7 @@ import csv
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Protocol
 
 import mujoco
 import numpy as np
@@ -125,8 +126,21 @@ def replay(
     return Replay(windows, simulated, spread, warnings + tuple(_unseen(model, windows.starts)))
 
 
+class Simulator(Protocol):
+    """Anything that simulates windows as :class:`WindowSimulator` does."""
+
+    @property
+    def windows(self) -> Windows:
+        """What it is run through."""
+        ...
+
+    def __call__(self, xi: Array | None = None, starts: States | None = None) -> Array:
+        """See :meth:`WindowSimulator.__call__`."""
+        ...
+
+
 def start_sensitivity(
-    model: mujoco.MjModel, simulator: WindowSimulator, xi: ArrayLike | None = None, nominal: Array | None = None
+    model: mujoco.MjModel, simulator: Simulator, xi: ArrayLike | None = None, nominal: Array | None = None
 ) -> Array:
     """How the predictions move when one number of the start moves by its standard error.
 

@@ -65,6 +65,7 @@ def cut_windows(
     seconds: float | None = None,
     step: float | None = None,
     keyframe: str | None = None,
+    history: float = 0.0,
 ) -> Windows:
     """Cut recordings into windows with estimated starts.
 
@@ -77,6 +78,7 @@ def cut_windows(
         seconds: length of a window; None for one window per recording, of its whole length (or of the shortest one's).
         step: seconds between starts; the length by default, so that windows do not overlap.
         keyframe: where joints without a column start, see :func:`estimate_states`.
+        history: seconds of commands before the start to keep, at least as many as the model's delays need.
 
     Raises:
         ValueError: if an actuator has no column, no column names anything in the model, recordings differ in their
@@ -95,7 +97,7 @@ def cut_windows(
     grids = [recording.resample(period) for recording in recordings]
     samples = min(len(grid) for grid in grids) if seconds is None else round(seconds / period) + 1
     hop = samples if seconds is None else max(1, round((step or seconds) / period))
-    past = _longest_history(model)
+    past = max(_longest_history(model), int(np.ceil(history / timestep)) + 1)
     parts = []
     for recording, grid in zip(recordings, grids, strict=True):
         starts = np.arange(0, len(grid) - samples + 1, hop)[: 1 if seconds is None else None]
@@ -151,12 +153,15 @@ class WindowSimulator:
         else:
             self._engine = BatchEngine(model, self.space, windows, num_threads)
 
-    def __call__(self, xi: ArrayLike | None = None, starts: States | None = None) -> Array:
+    def __call__(
+        self, xi: ArrayLike | None = None, starts: States | None = None, commands: Array | None = None
+    ) -> Array:
         """Simulate the windows.
 
         Args:
             xi: (n, d); None for the model as it is, n = 1.
             starts: states other than the windows' own: w, or n w, the first ξ's w first.
+            commands: other than the windows' own, for each ξ, (n w, N, nu).
 
         Returns:
             (n, w, S, c), NaN from where a simulation diverged.
@@ -169,8 +174,11 @@ class WindowSimulator:
         if len(starts) == len(self.windows):
             starts = starts.select(np.tile(np.arange(len(starts)), len(values)))
         per_xi = np.arange(len(starts)).reshape(len(values), -1)
+        if commands is None:
+            commands = np.tile(self.windows.commands, (len(values), 1, 1))
         chunks = [slice(i, i + self._xi_at_once) for i in range(0, len(values), self._xi_at_once)]
-        return np.concatenate([self._engine.run(values[c], starts.select(per_xi[c].ravel())) for c in chunks])
+        rows = [(chunk, per_xi[chunk].ravel()) for chunk in chunks]
+        return np.concatenate([self._engine.run(values[c], starts.select(r), commands[r]) for c, r in rows])
 
 
 def simulate_windows(

@@ -1,9 +1,11 @@
-"""What MJCF cannot say of a sensor: a column that shows a scaled, shifted or late value of what it stands for.
+"""What acts outside the model: columns that show something else than what they stand for, and commands that are late.
 
-A parameter that writes ``column.bias``, ``column.scale`` or ``column.delay`` of a column acts here, after the
-simulation, and not on the model:
+A parameter that writes ``column.bias``, ``column.scale`` or ``column.delay`` of a column acts after the simulation,
 
-    shown(t) = scale * true(t - delay) + bias.
+    shown(t) = scale * true(t - delay) + bias,
+
+and one that writes ``command.delay`` of an actuator acts before it. (MuJoCo's own delays are at least one timestep
+long, as a command is stored after it was used: what is shorter cannot be said in MJCF.)
 """
 
 from __future__ import annotations
@@ -15,13 +17,13 @@ from scipy.interpolate import CubicSpline
 
 from simopt_envs.physics.parameters import Array, Parameter, ParameterSpace
 
-_FIELD = "column."
+_OUTSIDE = ("column.", "command.")
 _NEUTRAL = {"column.bias": 0.0, "column.scale": 1.0, "column.delay": 0.0}
 
 
 def acts_on_columns(parameter: Parameter) -> bool:
-    """Whether a parameter changes what a sensor shows, and not the model."""
-    return any(write.field.startswith(_FIELD) for write in parameter.writes)
+    """Whether a parameter changes columns of recordings, what sensors show or when commands arrive, not the model."""
+    return any(write.field.startswith(_OUTSIDE) for write in parameter.writes)
 
 
 class ColumnModel:
@@ -63,6 +65,56 @@ class ColumnModel:
         if field == "column.scale":
             return np.prod(xi[:, mine], axis=1)
         return np.sum(xi[:, mine], axis=1)
+
+
+class CommandModel:
+    """When commands arrive, for values of a space.
+
+    Args:
+        space: parameters; those that write no ``command.delay`` do nothing here.
+        actuators: names of the commanded actuators, nu of them.
+    """
+
+    def __init__(self, space: ParameterSpace, actuators: Sequence[str]):
+        self._places = [
+            (actuators.index(write.object), i)
+            for i, parameter in enumerate(space)
+            for write in parameter.writes
+            if write.field == "command.delay" and write.object is not None
+        ]
+        self._count = len(actuators)
+
+    def delays(self, xi: Array) -> Array:
+        """Seconds for ξ (n, d) and each actuator, (n, nu)."""
+        delays = np.zeros((len(xi), self._count))
+        for actuator, i in self._places:
+            delays[:, actuator] += xi[:, i]
+        return delays
+
+    def arriving(self, past: Array, commands: Array, xi: Array, timestep: float) -> Array:
+        """What arrives in each step, linear between steps.
+
+        Args:
+            past: commands before the first step, (w, P, nu), oldest first.
+            commands: as given, (w, N, nu).
+            xi: (n, d).
+            timestep: of the steps [s].
+
+        Returns:
+            (n, w, N, nu).
+        """
+        stream = np.concatenate([past, commands], axis=1)
+        at = past.shape[1] + np.arange(commands.shape[1])
+        steps = np.clip(self.delays(xi) / timestep, 0, past.shape[1] - 1)
+        whole = np.floor(steps).astype(np.intp)
+        out = np.empty((len(xi), *commands.shape))
+        for actuator in range(self._count):
+            late = at - whole[:, actuator, None]  # (n, N)
+            part = (steps[:, actuator] - whole[:, actuator])[:, None, None]
+            values = stream[:, :, actuator]
+            now, before = (np.moveaxis(values[:, index], 1, 0) for index in (late, late - 1))
+            out[..., actuator] = (1 - part) * now + part * before
+        return out
 
 
 def _shifted(values: Array, delay: Array, period: float) -> Array:

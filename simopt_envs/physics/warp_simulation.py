@@ -86,6 +86,13 @@ class WarpSimulation:
         self._bound: dict[str, Tensor] = {}
         self._reference = mujoco.MjData(model)  # for the shapes of its fields
         self._graphs: dict[int, Any] = {}
+        # Of bodies that only slide, Warp's set_const has other inverse weights than MuJoCo, by a factor without ξ.
+        self._weights, self._factors = wp.to_torch(self._model.body_invweight0), self.asarray(model.body_invweight0)
+        if self._writer.needs_set_const:
+            with wp.ScopedDevice(self._device):
+                mjw.set_const(self._model, self._data)
+            self._factors = torch.where(self._weights[0] == 0.0, 1.0, self._factors / self._weights[0])
+            self._weights *= self._factors
 
     def asarray(self, values: ArrayLike) -> Tensor:
         """See :meth:`Simulation.asarray`."""
@@ -111,13 +118,14 @@ class WarpSimulation:
 
         if not len(worlds):
             return
-        rows = {name: np.stack([model_field(self.model, name)] * len(worlds)) for name in self._fields}
+        rows = {name: model_field(self.model, name)[None].repeat(len(worlds), axis=0) for name in self._fields}
         self._writer.write(xi, rows.__getitem__)
         for name, values in rows.items():
             self._fields[name][worlds] = self.asarray(values)
         with wp.ScopedDevice(self._device):
             if self._writer.needs_set_const:
                 mjw.set_const(self._model, self._data)
+                self._weights *= self._factors
             # Kinematics leaves out the geoms of bodies that cannot move, but ξ does move some.
             welded_to, self._model.body_weldid = self._model.body_weldid, wp.full(self.model.nbody, -1, dtype=int)
             mjw.kinematics(self._model, self._data)

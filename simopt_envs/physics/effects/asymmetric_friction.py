@@ -5,9 +5,11 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from simopt_envs.physics.effects.effect import Effect, Motion, object_name
+from simopt_envs.physics.effects.effect import Effect, Motion, Values, object_name
 from simopt_envs.physics.effects.joints import add_passive_motor, force_unit, probe_force, scalar_joints
 from simopt_envs.physics.parameters import Parameter, Write
+
+_LEAST_DIFFERENCE = 0.5  # of the level
 
 
 class AsymmetricFriction(Effect):
@@ -44,3 +46,7 @@ class AsymmetricFriction(Effect):
         """See :meth:`Effect.probes`."""
         force = probe_force(model, object_name(place), motion)
         return tuple({"frictionloss": force, "difference": difference} for difference in (force, -force))
+
+    def is_itself(self, values: Values) -> bool:
+        """A difference below half the level is what a symmetric friction and a constant force are called."""
+        return abs(values["difference"]) > _LEAST_DIFFERENCE * values["frictionloss"]

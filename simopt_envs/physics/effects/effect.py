@@ -76,6 +76,10 @@ class Effect(ABC):
         needs a probe of its own. Every parameter has a size in at least one probe that differs from its nominal.
         """
 
+    def is_itself(self, values: Values) -> bool:
+        """Whether fitted values are what the effect's name means, where other effects can look the same."""
+        return True
+
 
 def object_name(place: str) -> str:
     """``"joint:elbow"`` -> ``"elbow"``."""
