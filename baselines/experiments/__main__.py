@@ -1,0 +1,75 @@
+"""The command line: ``python -m baselines.experiments [QUESTION ...] [--quick]``."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from baselines.experiments import ablations, iterations, learned_distribution, randomization, robots, update_rules
+from baselines.experiments.cell import Store
+from baselines.experiments.document import Question, write_document
+from baselines.experiments.runner import run_cells
+from baselines.experiments.workspace import SMOKE, Effort, Workspace
+from simopt_envs.physics.parameters import unknown_name
+
+QUESTIONS: dict[str, Question] = {
+    module.QUESTION.name: module.QUESTION
+    for module in (randomization, learned_distribution, iterations, robots, update_rules, ablations)
+}
+
+
+@dataclass(frozen=True)
+class Experiments:
+    """The paper's questions, answered by running them. What is finished is not run again."""
+
+    questions: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[QUESTION ...]")] = ()
+    """Some of randomization, learned_distribution, iterations, robots, update_rules, ablations; all by default."""
+    quick: bool = False
+    """Only a part: fewer seeds and conditions, a quarter of an hour on two cores for all questions."""
+    out: Path = Path("out/experiments")
+    """Folder for results, policies and runs of SimOpt."""
+    docs: Path = Path("docs/experiments")
+    """Folder for the pages and figures."""
+    report: bool = False
+    """Run nothing; write the pages of what is finished."""
+    smoke: bool = False
+    """Spend next to nothing on each cell, to see that all of them run; the figures then mean nothing."""
+
+    def __post_init__(self) -> None:
+        for name in self.questions:
+            if name not in QUESTIONS:
+                raise ValueError(unknown_name("question", name, QUESTIONS))
+
+    def run(self) -> int:
+        """Run and write; the exit code."""
+        effort = SMOKE if self.smoke else Effort()
+        store = Store(self.out / "cells", effort)
+        chosen = [QUESTIONS[name] for name in self.questions or QUESTIONS]
+        failed = []
+        if not self.report:
+            cells = [cell for question in chosen for cell in question.cells() if cell.quick or not self.quick]
+            failed = run_cells(cells, store, lambda tell: Workspace(self.out, effort, tell))
+        for question in chosen:
+            page = write_document(question, store, self.docs)
+            print(f"{question.name}: {page or 'nothing is finished yet'}")
+        return 1 if failed else 0
+
+
+def main() -> None:
+    """Run what the command line says."""
+    try:
+        sys.exit(tyro.cli(Experiments, prog="python -m baselines.experiments").run())
+    except KeyboardInterrupt as interrupt:
+        print(f"\n{interrupt}", file=sys.stderr)
+        sys.exit(130)
+    except (ValueError, ImportError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,96 @@
+"""The page of a question: its table and figure, beside the command and seeds that made them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from inspect import cleandoc
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from baselines.experiments.cell import Cell, Results, Store
+from simopt_envs.report.figures import save_figure, styled
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of texts."""
+
+    caption: str
+    header: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+    def markdown(self) -> str:
+        """As Markdown."""
+        lines = [self.header, ["---"] * len(self.header), *self.rows]
+        return "\n".join([f"{self.caption}\n", *("| " + " | ".join(line) + " |" for line in lines)])
+
+
+@dataclass(frozen=True)
+class Question:
+    """A question of the paper, or one that it leaves open.
+
+    Attributes:
+        name: on the command line and of its files.
+        title: the question.
+        setting: what is done, a paragraph.
+        paper: what the paper found.
+        cells: declares them.
+        tables: of results.
+        figure: of results.
+        findings: sentences that compare results with each other and with the paper.
+    """
+
+    name: str
+    title: str
+    setting: str
+    paper: str
+    cells: Callable[[], list[Cell]]
+    tables: Callable[[Results], list[Table]]
+    figure: Callable[[Results], Figure]
+    findings: Callable[[Results], list[str]]
+
+
+def write_document(question: Question, store: Store, docs: Path) -> Path | None:
+    """Write the page and the figure of what is finished; None if nothing is."""
+    cells = question.cells()
+    results = store.results(cells)
+    if not results:
+        return None
+    docs.mkdir(parents=True, exist_ok=True)
+    figure = docs / f"{question.name}.png"
+    save_figure(styled(question.figure)(results), figure)
+    found = [f"* {sentence}" for sentence in question.findings(results)] or ["Too little is finished to say."]
+    parts = [
+        f"# {question.title}",
+        cleandoc(question.setting),
+        f"![{question.title}]({figure.name})",
+        *(table.markdown() for table in question.tables(results) if table.rows),
+        "## What came out",
+        "\n".join(found),
+        "## In the paper",
+        cleandoc(question.paper),
+        "## How it was made",
+        _made(question, cells, results, store),
+    ]
+    page = docs / f"{question.name}.md"
+    page.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
+    return page
+
+
+def _made(question: Question, cells: list[Cell], results: Results, store: Store) -> str:
+    missing = [cell for cell in cells if cell.seed not in results.get(cell.condition, {})]
+    finished = len(cells) - len(missing)
+    quick = " --quick" if missing and all(not cell.quick for cell in missing) else ""
+    seeds = sorted({seed for of_seed in results.values() for seed in of_seed})
+    lines = [
+        f"`python -m baselines.experiments {question.name}{quick}`; seeds {', '.join(map(str, seeds))}; {finished} of"
+        f" {len(cells)} cells, which took {store.seconds(cells) / 3600:.1f} h in all.",
+        "Square brackets hold 95 % intervals: of the seeds by bootstrap, for success also of the episodes it was"
+        " counted over. The interval of a success that has one seed only is that of its episodes.",
+    ]
+    if missing:
+        conditions = dict.fromkeys(cell.condition for cell in missing if cell.condition not in results)
+        lines.append(f"Not run yet: {', '.join(conditions) or 'some seeds'}.")
+    return "\n\n".join(lines)
