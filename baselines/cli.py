@@ -47,10 +47,11 @@ def _run(arguments: list[str]) -> None:
 
     from baselines.commands.adapt import Adapt
     from baselines.commands.demo import Demo
+    from baselines.commands.gap import Gap
     from baselines.commands.logs import Inspect, Replay, Report
 
     command = tyro.cli(
-        Adapt | Demo | Inspect | Replay | Report,  # the subcommands
+        Adapt | Demo | Gap | Inspect | Replay | Report,  # the subcommands
         prog=_PROGRAM,
         description="Simulations with randomizable physics, adapted to real systems by SimOpt.",
         args=arguments,

@@ -17,7 +17,7 @@ from scipy.interpolate import CubicSpline
 
 from simopt_envs.physics.parameters import Array, Parameter, ParameterSpace
 
-_OUTSIDE = ("column.", "command.")
+_OUTSIDE = ("column.", "command.", "clock.")
 _NEUTRAL = {"column.bias": 0.0, "column.scale": 1.0, "column.delay": 0.0}
 
 

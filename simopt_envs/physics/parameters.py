@@ -29,7 +29,7 @@ class Write:
         object: name of the joint, body, geom, ... whose rows are written. None for options.
         index: columns within a row, ``(0, 1)`` of ``pair_friction``; None writes the whole row.
         operation: ``"set"`` writes the value, ``"scale"`` multiplies the remembered nominal by
-            (value / the parameter's nominal) ** power, ``"add"`` adds factor * value to it. Several parameters may
+            (value / the parameter's baseline) ** power, ``"add"`` adds factor * value to it. Several parameters may
             write the same place: it is set first, then scaled, then shifted, always from the model as it was compiled.
         power: exponent of ``"scale"``: a rod's mass goes with the second power of its width.
         factor: of ``"add"``: a force at a joint is a gear's ratio times smaller at its motor.
@@ -55,6 +55,7 @@ class Parameter:
         coordinate: ``"log"`` for scale-like quantities (> 0), ``"linear"`` for offsets.
         writes: the places in the model that it writes.
         description: one line for people.
+        baseline: the value at which ``"scale"`` leaves the model as compiled; None for the nominal.
     """
 
     name: str
@@ -65,6 +66,7 @@ class Parameter:
     coordinate: Coordinate = "log"
     writes: tuple[Write, ...] = ()
     description: str = ""
+    baseline: float | None = None
 
     def __post_init__(self) -> None:
         """Raise ValueError where the numbers contradict one another."""
@@ -77,8 +79,13 @@ class Parameter:
             )
         if self.coordinate == "log" and self.low <= 0:
             raise ValueError(f"parameter {self.name!r}: a log coordinate needs low > 0, got {self.low:g} {self.unit}")
-        if self.nominal == 0 and any(w.operation == "scale" for w in self.writes):
+        if self.neutral == 0 and any(w.operation == "scale" for w in self.writes):
             raise ValueError(f"parameter {self.name!r}: a nominal of 0 cannot be scaled")
+
+    @property
+    def neutral(self) -> float:
+        """What ``"scale"`` counts from."""
+        return self.nominal if self.baseline is None else self.baseline
 
 
 class ParameterSpace:

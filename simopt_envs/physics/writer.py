@@ -52,7 +52,7 @@ class _FieldPlan:
     elements: NDArray[np.intp]  # (m,) flat positions in the field
     nominal: Array  # (m,) the model as compiled
     set_columns: tuple[tuple[NDArray[np.intp], int], ...]  # (positions among the m, parameter)
-    scale_columns: tuple[tuple[NDArray[np.intp], int, float, float], ...]  # (positions, parameter, nominal, power)
+    scale_columns: tuple[tuple[NDArray[np.intp], int, float, float], ...]  # (positions, parameter, neutral, power)
     add_columns: tuple[tuple[NDArray[np.intp], int, float], ...]  # (positions, parameter, factor)
 
     def values(self, xi: Array) -> Array:
@@ -60,8 +60,8 @@ class _FieldPlan:
         out = np.tile(self.nominal, (len(xi), 1))
         for at, p in self.set_columns:
             out[:, at] = xi[:, p, None]
-        for at, p, nominal, power in self.scale_columns:
-            out[:, at] *= (xi[:, p, None] / nominal) ** power
+        for at, p, neutral, power in self.scale_columns:
+            out[:, at] *= (xi[:, p, None] / neutral) ** power
         for at, p, factor in self.add_columns:
             out[:, at] += factor * xi[:, p, None]
         return out
@@ -203,7 +203,7 @@ def _plans(model: mujoco.MjModel, space: ParameterSpace) -> Iterator[tuple[str, 
                 elements=elements,
                 nominal=model_field(model, field).ravel()[elements].astype(np.float64),
                 set_columns=tuple(sets),
-                scale_columns=tuple((a, i, p.nominal, w.power) for p, i, w, a in at if w.operation == "scale"),
+                scale_columns=tuple((a, i, p.neutral, w.power) for p, i, w, a in at if w.operation == "scale"),
                 add_columns=tuple((a, i, w.factor) for _, i, w, a in at if w.operation == "add"),
             ),
         )

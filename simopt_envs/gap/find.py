@@ -1,0 +1,107 @@
+"""The gap workflow: from a model and recordings to what the model lacks."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from simopt_envs.distributions.gaussian import Gaussian
+from simopt_envs.gap.describe import Residual, describe
+from simopt_envs.gap.error import held_out_errors
+from simopt_envs.gap.hypothesis import Candidate
+from simopt_envs.gap.localise import localise
+from simopt_envs.gap.motion import motion_of
+from simopt_envs.gap.plain import Plain, plain_parameters
+from simopt_envs.gap.recordings import read_windows
+from simopt_envs.gap.result import Gap, judge, named_effects, repair
+from simopt_envs.gap.search import Data, Explanation, Progress, Search
+from simopt_envs.measured.mapping import LogMapping
+from simopt_envs.measured.readers import load_recordings
+from simopt_envs.measured.recording import Recording
+from simopt_envs.measured.windows import Windows
+from simopt_envs.physics.effects import EFFECTS, Effect
+
+_SEED = 0  # of the bootstrap
+
+
+def find_gap(
+    model: str | Path | mujoco.MjSpec,
+    recordings: Sequence[str | Path | Recording],
+    *,
+    plain: Gaussian | None = None,
+    mapping: LogMapping | str | Path | None = None,
+    keyframe: str | None = None,
+    effects: Sequence[Effect] = tuple(EFFECTS.values()),
+    progress: Progress = lambda *_: None,
+) -> Gap:
+    """Find where a model and recordings disagree, and which physical effect is missing.
+
+    Args:
+        model: an MJCF file, or a spec.
+        recordings: of the real system: files or what was read from them.
+        plain: p(ξ) of the plain parameters before the data: what a refit may move before anything is called
+            missing. None for those of a good data sheet, see :func:`~simopt_envs.gap.plain.plain_parameters`.
+        mapping: names the columns of foreign logs.
+        keyframe: where joints without a column start.
+        effects: the library to search.
+        progress: is told of what is being done.
+
+    Raises:
+        FileNotFoundError: for a file that does not exist.
+        ValueError: for a model that does not compile, recordings that do not fit it, or audits that found errors.
+    """
+    began = time.perf_counter()
+    given = _spec(model)
+    start = plain_parameters(given) if plain is None else Plain.of(given, plain)
+    read = [
+        r for item in recordings for r in ([item] if isinstance(item, Recording) else load_recordings(item, mapping))
+    ]
+    data = read_windows(start.model, read, keyframe)
+    motion = motion_of(start.model, read, keyframe)
+    seen = tuple(c for effect in effects for c in _places(effect, start.model) if _shows(c, data.fitted))
+    explanation = Search(start, data, motion, seen, progress).run()
+    return _gap(given, explanation, data, time.perf_counter() - began)
+
+
+def _gap(given: mujoco.MjSpec, explanation: Explanation, data: Data, seconds: float) -> Gap:
+    null, final = explanation.null, explanation.final
+    verdict = judge(explanation)
+    if verdict == "unexplained":
+        final = null
+    as_given = null.hypothesis.space.nominal
+    fitted = [base.hypothesis.xi(base.fit.u[None])[0] for base in (null, final)]
+    models = [(null.hypothesis, as_given), (null.hypothesis, fitted[0]), (final.hypothesis, fitted[1])]
+    errors = held_out_errors(data.held_out, models, null.noise.scale, np.random.default_rng(_SEED))
+    explained = Explanation(null, final, explanation.stages)
+    spec, diff = repair(explained, given, fitted[1])
+    rows = localise(data.held_out, null.held_out, null.hypothesis.plain.model)
+    residuals = [
+        Residual(data.fitted, final.fit.errors, final.noise),
+        Residual(data.held_out, final.held_out, final.held_out_noise),
+    ]
+    left = describe(final.hypothesis, final.fit.u, residuals)
+    return Gap(verdict, named_effects(explained), errors, rows, left, explanation, data, spec, diff, seconds)
+
+
+def _spec(model: str | Path | mujoco.MjSpec) -> mujoco.MjSpec:
+    if isinstance(model, mujoco.MjSpec):
+        return model
+    if not Path(model).exists():
+        raise FileNotFoundError(f"there is no model {model}")
+    return mujoco.MjSpec.from_file(str(model))
+
+
+def _places(effect: Effect, model: mujoco.MjModel) -> list[Candidate]:
+    return [Candidate(effect, place) for place in effect.places(model)]
+
+
+def _shows(candidate: Candidate, windows: Windows) -> bool:
+    """Whether a candidate that acts on what sensors show alone acts on a column that there is."""
+    kind, _, name = candidate.place.partition(":")
+    if kind in ("site", "sensor"):
+        return any(column.startswith(f"{kind}/{name}") for column in windows.names)
+    return True

@@ -1,0 +1,183 @@
+"""Fits of a hypothesis to windows of recordings: multiple shooting, with the errors of the starts marginalised.
+
+A fit makes 1/2 |C^(-1/2) (simulated - measured)|² + 1/2 |u / prior std|² small, C = diag(σ²) + S P₀ Sᵀ with the noise σ
+of the sensors and the covariance S P₀ Sᵀ that uncertain starts leave in a window.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from mujoco import minimize
+
+from simopt_envs.adaptation.fitting import Noise
+from simopt_envs.gap.hypothesis import Hypothesis
+from simopt_envs.measured.replay import start_sensitivity
+from simopt_envs.measured.windows import Windows
+from simopt_envs.physics.parameters import Array
+
+_DIFFERENCE = 2e-3  # of a unit of u: above what the constraint solver leaves, below where a law bends
+_KINK = 6.0  # medians: four standard deviations
+_DIVERGED = 30.0  # the error, in units of noise, of a sample that a simulation did not reach
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Where a fit ended.
+
+    Attributes:
+        u: coordinates of ξ, (d,).
+        errors: whitened errors of the data there, (w, S, c); 0 where nothing was measured.
+        jacobian: their derivative by u, (w S c, d).
+        prior_std: of u, (d,).
+    """
+
+    u: Array
+    errors: Array
+    jacobian: Array
+    prior_std: Array
+
+    @property
+    def chi2(self) -> float:
+        """Sum of the squared whitened errors."""
+        return float(np.sum(self.errors**2))
+
+    @property
+    def loss(self) -> float:
+        """-log p(u | data), up to a constant."""
+        return 0.5 * (self.chi2 + float(np.sum((self.u / self.prior_std) ** 2)))
+
+    @property
+    def rows(self) -> Array:
+        """The Jacobian of errors and prior, (m + d, d)."""
+        return np.vstack([self.jacobian, np.diag(1 / self.prior_std)])
+
+    @property
+    def residual(self) -> Array:
+        """Errors and prior, (m + d,)."""
+        return np.concatenate([self.errors.ravel(), self.u / self.prior_std])
+
+    @cached_property
+    def orthonormal(self) -> tuple[Array, Array]:
+        """The QR decomposition of :attr:`rows`."""
+        orthonormal, triangle = np.linalg.qr(self.rows)
+        return orthonormal, triangle
+
+    def covariance(self) -> Array:
+        """Of u, from the Gauss-Newton Hessian, for errors of variance 1."""
+        rows = self.rows
+        return np.asarray(np.linalg.pinv(rows.T @ rows, hermitian=True), dtype=np.float64)
+
+
+class Misfit:
+    """Whitened errors of a hypothesis on windows.
+
+    Args:
+        hypothesis: what is simulated.
+        windows: what it is compared with.
+
+    Attributes:
+        noise: that errors are counted in: 1 in all channels, until :meth:`with_noise`.
+    """
+
+    def __init__(self, hypothesis: Hypothesis, windows: Windows):
+        self.hypothesis = hypothesis
+        self.noise = Noise.of(np.ones(len(windows.channels)), np.zeros((1, *windows.measured.shape)))
+        self._simulate = hypothesis.simulator(windows)
+        self._measured = windows.measured
+        self._counted = np.isfinite(windows.measured)
+
+    @property
+    def samples(self) -> int:
+        """How many numbers were measured."""
+        return int(self._counted.sum())
+
+    def with_noise(self, noise: Noise) -> Misfit:
+        """The same with another noise, and the worlds that are there."""
+        other = object.__new__(Misfit)
+        other.__dict__.update(self.__dict__, noise=noise)
+        return other
+
+    def simulated(self, u: Array) -> Array:
+        """(n, d) -> (n, w, S, c)."""
+        return self._simulate(self.hypothesis.xi(u))
+
+    def errors(self, u: Array) -> Array:
+        """Whitened errors, (n, d) -> (n, w, S, c)."""
+        errors = self.simulated(u) - self._measured
+        diverged = np.isnan(errors) & self._counted
+        errors = np.where(diverged, _DIVERGED * self.noise.scale, np.where(self._counted, errors, 0.0))
+        return self.noise.whiten(errors)
+
+    def best(self, starts: Array) -> Array:
+        """The start (d,), of several (k, d), from which a fit has the least left to do."""
+        losses = np.sum(self.errors(starts) ** 2, axis=(1, 2, 3))
+        losses += np.sum((starts / self.hypothesis.prior_std) ** 2, axis=1)
+        return starts[np.argmin(losses)]
+
+    def jacobian(self, u: Array, errors: Array, columns: list[int]) -> Array:
+        """Derivative of the whitened errors by some of u (d,), (m, k); differences point into the bounds."""
+        steps = np.where(u[columns] + _DIFFERENCE <= self.hypothesis.high[columns], _DIFFERENCE, -_DIFFERENCE)
+        tried = np.tile(u, (len(columns), 1))
+        tried[np.arange(len(columns)), columns] += steps
+        moved = self.errors(tried).reshape(len(columns), -1)
+        return ((moved - errors.ravel()) / steps[:, None]).T
+
+    def noise_at(self, u: Array, scale: Array) -> Noise:
+        """The noise of sensors of a scale (c,) with what uncertain starts leave at u (d,)."""
+        starts = start_sensitivity(self.hypothesis.model, self._simulate, self.hypothesis.xi(u[None]))
+        return Noise.of(scale, np.where(self._counted, np.nan_to_num(starts), 0.0))
+
+    def noise_floor(self, u: Array) -> Array:
+        """Standard deviation of the part of the errors at u (d,) that one sample does not share with the next, (c,).
+
+        The second difference of errors in a row holds little of what a model lacks, which changes from sample to
+        sample by little; differences far beyond the others are kinks and do not count.
+        """
+        errors = np.where(self._counted, self.simulated(u[None])[0] - self._measured, np.nan)
+        second = np.abs(np.diff(errors, n=2, axis=1)).reshape(-1, errors.shape[-1])
+        kink = second > _KINK * np.nanmedian(second, axis=0)
+        return np.sqrt(np.nanmean(np.where(kink, np.nan, second) ** 2, axis=0) / 6.0)
+
+
+def fit(misfit: Misfit, start: Array, iterations: int, known: Array | None = None) -> Fit:
+    """The most probable u.
+
+    Args:
+        misfit: of a hypothesis.
+        start: u to begin from, (d,).
+        iterations: of Gauss-Newton with Levenberg's damping, at most.
+        known: the Jacobian by the first k of u, (m, k), where it is known well enough from a fit nearby: it saves the
+            most of the work. None to take all by differences.
+    """
+    hypothesis = misfit.hypothesis
+    fresh = list(range(0 if known is None else known.shape[1], len(start)))
+    shape = misfit.errors(start[None]).shape[1:]
+
+    def residual(columns: Array) -> Array:
+        u = np.clip(columns.T, hypothesis.low, hypothesis.high)
+        return np.hstack([misfit.errors(u).reshape(len(u), -1), u / hypothesis.prior_std]).T
+
+    def jacobian(u: Array, at: Array) -> Array:
+        u = np.ravel(u)
+        differences = misfit.jacobian(u, np.ravel(at)[: -len(u)], fresh)
+        data = differences if known is None else np.hstack([known, differences])
+        return np.vstack([data, np.diag(1 / hypothesis.prior_std)])
+
+    u, _ = minimize.least_squares(
+        np.clip(start, hypothesis.low, hypothesis.high),
+        residual,
+        bounds=[hypothesis.low, hypothesis.high],
+        jacobian=jacobian,
+        xtol=1e-2,
+        mu_min=1e-3,
+        mu_max=1e4,
+        mu_factor=10.0,
+        max_iter=iterations,
+        verbose=minimize.Verbosity.SILENT,
+    )
+    u = np.ravel(u)
+    errors = misfit.errors(u[None])[0]
+    return Fit(u, errors.reshape(shape), jacobian(u, residual(u[:, None]))[: -len(u)], hypothesis.prior_std)

@@ -1,0 +1,216 @@
+"""A hypothesis: the model with the structure of some effects, and a simulator of recordings for values of its ξ."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import mujoco
+import numpy as np
+
+from simopt_envs.gap.plain import INTEGRATION_LEAD, Plain
+from simopt_envs.measured.channels import Channel
+from simopt_envs.measured.states import States, reference_qpos
+from simopt_envs.measured.windows import Windows, WindowSimulator
+from simopt_envs.physics.columns import ColumnModel, CommandModel, acts_on_columns
+from simopt_envs.physics.effects import Effect, Motion, object_name
+from simopt_envs.physics.effects.actuators import actuators, command_sources, on_all_parts
+from simopt_envs.physics.effects.joints import scalar_joints
+from simopt_envs.physics.parameters import Array, Parameter, ParameterSpace
+
+_FREE = 100.0  # an effect's parameter has a prior this many probes wide: none to speak of
+_NEW_JOINT_ERROR = 1e-3  # rad or m, rad/s or m/s: a joint that an effect adds starts near its reference, at rest
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An effect at a place."""
+
+    effect: Effect
+    place: str
+
+    def __str__(self) -> str:
+        return f"{self.effect.name} at {self.place}"
+
+    def full_name(self, parameter: str) -> str:
+        """What its parameter is called in ξ: ``"coulomb_friction.elbow.frictionloss"``."""
+        return f"{self.effect.name}.{object_name(self.place)}.{parameter}"
+
+    def parameters(self, model: mujoco.MjModel) -> tuple[Parameter, ...]:
+        """Its parameters as they are called in ξ."""
+        return tuple(replace(p, name=self.full_name(p.name)) for p in self.effect.parameters(model, self.place))
+
+
+class Hypothesis:
+    """A model with some effects: plain parameters first in ξ, then those of each effect.
+
+    A fit's coordinates u are 0 at the prior's mean and count its standard deviations; an effect's parameters count the
+    probes of their sizes instead, from the value that leaves the model as it was.
+
+    Args:
+        plain: the model and its plain parameters.
+        candidates: the effects.
+        motion: of the recordings, for the sizes of probes.
+
+    Attributes:
+        spec, model: with the structure of the effects, at neutral values.
+        space: ξ.
+        prior_std: of u, (d,).
+        columns: of ξ that each candidate's parameters have.
+    """
+
+    def __init__(self, plain: Plain, candidates: Sequence[Candidate], motion: Motion):
+        self.plain, self.candidates, self.motion = plain, tuple(candidates), motion
+        self.spec = plain.spec.copy()
+        for candidate in candidates:
+            candidate.effect.add(self.spec, candidate.place)
+        self.model = self.spec.compile()
+        parameters = [on_all_parts(self.model, p) for p in plain.prior.space]
+        self.columns: dict[Candidate, list[int]] = {}
+        for candidate in candidates:
+            added = [on_all_parts(self.model, p) for p in candidate.parameters(self.model)]
+            self.columns[candidate] = list(range(len(parameters), len(parameters) + len(added)))
+            parameters += added
+        self.space = ParameterSpace(parameters)
+        self.num_plain = len(plain.prior.space)
+        nominal = self.space.to_unconstrained(self.space.nominal)
+        self._centre, self._unit = nominal.copy(), np.ones(len(nominal))
+        self._centre[: self.num_plain] = plain.prior.mean
+        self._unit[: self.num_plain] = plain.prior.std
+        for candidate, columns in self.columns.items():
+            z = np.array([self.space.to_unconstrained(self._probe(candidate, p)) for p in self._probes(candidate)])
+            self._unit[columns] = np.abs(z - nominal).max(axis=0)[columns]
+        self.prior_std = np.full(len(nominal), _FREE)
+        self.prior_std[: self.num_plain] = 1.0
+        self.low, self.high = (self.coordinates(bound) for bound in (self.space.low, self.space.high))
+
+    def xi(self, u: Array) -> Array:
+        """Coordinates (n, d) -> physical values, within the bounds."""
+        z = self._centre + self._unit * u
+        return np.clip(self.space.from_unconstrained(z), self.space.low, self.space.high)
+
+    def coordinates(self, xi: Array) -> Array:
+        """Physical values (..., d) -> u."""
+        return (self.space.to_unconstrained(xi) - self._centre) / self._unit
+
+    def probes(self, candidate: Candidate) -> Array:
+        """The effect's probes (k, d) in u, the rest at 0."""
+        nominal = self.coordinates(self.space.nominal)
+        columns = self.columns[candidate]
+        out = np.zeros((len(self._probes(candidate)), len(nominal)))
+        for row, probe in zip(out, self._probes(candidate), strict=True):
+            row[columns] = self.coordinates(self._probe(candidate, probe))[columns]
+        return out
+
+    def neutral(self) -> Array:
+        """(d,): plain parameters at their prior's mean, no effect."""
+        u = self.coordinates(self.space.nominal)
+        u[: self.num_plain] = 0.0
+        return u
+
+    def values(self, candidate: Candidate, u: Array) -> dict[str, float]:
+        """A candidate's parameters by their short names, at u (d,)."""
+        xi = self.xi(u[None])[0]
+        return {
+            self.space.names[i].removeprefix(candidate.full_name("")): float(xi[i]) for i in self.columns[candidate]
+        }
+
+    def without(self, candidate: Candidate, u: Array) -> Array:
+        """Coordinates (d,) with those of one candidate left out."""
+        return np.delete(u, self.columns[candidate])
+
+    def simulator(self, windows: Windows) -> HypothesisSimulator:
+        """A simulator of windows for values of ξ."""
+        return HypothesisSimulator(self, windows)
+
+    def _probes(self, candidate: Candidate) -> tuple[dict[str, float], ...]:
+        return candidate.effect.probes(self.plain.model, candidate.place, self.motion)
+
+    def _probe(self, candidate: Candidate, probe: dict[str, float]) -> Array:
+        return self.space.values({candidate.full_name(name): value for name, value in probe.items()})
+
+
+class HypothesisSimulator:
+    """Runs a hypothesis through windows; see :class:`~simopt_envs.measured.windows.WindowSimulator`."""
+
+    def __init__(self, hypothesis: Hypothesis, windows: Windows):
+        self._given, self._sources = windows, command_sources(hypothesis.model)
+        self.windows = replace(
+            windows,
+            commands=windows.commands[..., self._sources],
+            past_commands=windows.past_commands[..., self._sources],
+            starts=_starts_of(hypothesis.model, windows.starts, hypothesis.plain.model),
+        )
+        self._nominal = hypothesis.space.nominal[None]
+        self._model, self._period = hypothesis.model, float(windows.offsets[1])
+        self._scalar = scalar_joints(hypothesis.model)
+        self._lead = [i for i, p in enumerate(hypothesis.space) if p.name == INTEGRATION_LEAD]
+        self._ahead = [c for c, channel in enumerate(windows.channels) if _is_position(hypothesis.model, channel)]
+        self._columns = ColumnModel(hypothesis.space, windows.names)
+        drives = [object_name(place) for place in actuators(hypothesis.plain.model)]
+        self._commands = CommandModel(hypothesis.space, drives)
+        self._timestep = float(hypothesis.model.opt.timestep)
+        self._of_model = [i for i, p in enumerate(hypothesis.space) if not acts_on_columns(p)]
+        space = ParameterSpace(hypothesis.space.parameters[i] for i in self._of_model)
+        self._simulate = WindowSimulator(hypothesis.model, self.windows, space)
+
+    def __call__(self, xi: Array | None = None, starts: States | None = None) -> Array:
+        """Predicted columns (n, w, S, c) for ξ (n, d), by default the nominal one; NaN from where it diverged."""
+        xi = self._nominal if xi is None else xi
+        starts = self.windows.starts if starts is None else starts
+        true = self._simulate(xi[:, self._of_model], self._meant(starts, xi), self._arriving(xi))
+        lead = np.sum(xi[:, self._lead], axis=1)[:, None, None, None]
+        true[..., self._ahead] -= lead * np.gradient(true[..., self._ahead], self._period, axis=2)
+        return self._columns.shown(true, xi, self._period) if self._columns else true
+
+    def _is_scalar(self, channel: Channel) -> bool:
+        return f"joint:{self._model.joint(channel.object).name}" in self._scalar
+
+    def _dof(self, channel: Channel) -> int:
+        return int(self._model.jnt_dofadr[channel.object])
+
+    def _arriving(self, xi: Array) -> Array:
+        """Commands of the model's controls for each ξ and window, (n w, N, nu)."""
+        given = self._given
+        late = self._commands.arriving(given.past_commands, given.commands, xi, self._timestep)
+        return late[..., self._sources].reshape(-1, given.commands.shape[1], len(self._sources))
+
+    def _meant(self, starts: States, xi: Array) -> States:
+        """The states to start from, for each ξ, so that sensors show the measured starts."""
+        repeated = starts.select(np.tile(np.arange(len(starts)), len(xi)))
+        for c, channel in enumerate(self.windows.channels if self._columns else ()):
+            if channel.kind in ("qpos", "qvel") and self._is_scalar(channel):
+                values = getattr(starts, channel.kind)[:, channel.index]
+                rate = starts.qvel[:, self._dof(channel)] if channel.kind == "qpos" else np.zeros(len(starts))
+                getattr(repeated, channel.kind)[:, channel.index] = self._columns.meant(values, rate, c, xi).ravel()
+        leads = np.repeat(np.sum(xi[:, self._lead], axis=1), len(starts))
+        for qpos, qvel, lead in zip(repeated.qpos, repeated.qvel, leads, strict=True):
+            mujoco.mj_integratePos(self._model, qpos, qvel, float(lead))
+        return repeated
+
+
+def _is_position(model: mujoco.MjModel, channel: Channel) -> bool:
+    """Whether a column follows from positions alone."""
+    if channel.kind == "sensordata":
+        return int(model.sensor_needstage[channel.object]) == int(mujoco.mjtStage.mjSTAGE_POS)
+    return channel.kind in ("qpos", "site_xpos")
+
+
+def _starts_of(model: mujoco.MjModel, starts: States, given: mujoco.MjModel) -> States:
+    """The starts of the model as given in a model with more joints, those at their reference."""
+    if given.nq == model.nq:
+        return starts
+    w = len(starts)
+    qpos, qvel = np.tile(reference_qpos(model), (w, 1)), np.zeros((w, model.nv))
+    errors = [np.full((w, model.nv), _NEW_JOINT_ERROR) for _ in range(2)]
+    for j in range(given.njnt):
+        new = model.joint(given.joint(j).name)
+        old = given.joint(j)
+        qpos[:, new.qposadr[0] : new.qposadr[0] + len(old.qpos0)] = starts.qpos[
+            :, old.qposadr[0] : old.qposadr[0] + len(old.qpos0)
+        ]
+        of_new = slice(new.dofadr[0], new.dofadr[0] + len(old.damping))
+        of_old = slice(old.dofadr[0], old.dofadr[0] + len(old.damping))
+        for target, source in zip((qvel, *errors), (starts.qvel, starts.qpos_error, starts.qvel_error), strict=True):
+            target[:, of_new] = source[:, of_old]
+    return States(qpos, qvel, *errors)

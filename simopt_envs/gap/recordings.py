@@ -1,0 +1,77 @@
+"""The recordings of a gap search: which are fitted, which are held out, and the windows of both."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+
+from simopt_envs.gap.search import Data
+from simopt_envs.gap.thresholds import WINDOW
+from simopt_envs.measured.audit import audited
+from simopt_envs.measured.recording import Finding, Recording
+from simopt_envs.measured.windows import cut_windows
+from simopt_envs.physics.effects.actuator_delay import LONGEST
+
+_GUARD = 0.5  # seconds between what is fitted of a single recording and what is held out
+_FITTED = 0.6  # share of a single recording that is fitted
+
+
+def split(recordings: Sequence[Recording]) -> tuple[list[Recording], list[Recording], tuple[Finding, ...]]:
+    """The recordings to fit and those held out, and a warning where that could not be done by recording.
+
+    They are taken in turns in the order of how fast they move, so that both halves hold slow and fast ones.
+
+    Raises:
+        ValueError: without recordings.
+    """
+    if not recordings:
+        raise ValueError("a gap search needs at least one recording")
+    if len(recordings) == 1:
+        fitted, held_out = recordings[0].split(_FITTED, _GUARD)
+        only = Finding.warning(
+            recordings[0].name, "held-out", "one recording only: its later part is held out, in the same motion"
+        )
+        return [fitted], [replace(held_out, name=f"{held_out.name} (later part)")], (only,)
+    ordered = sorted(recordings, key=_liveliness)
+    return ordered[0::2], ordered[1::2], ()
+
+
+def read_windows(model: mujoco.MjModel, recordings: Sequence[Recording], keyframe: str | None = None) -> Data:
+    """Windows of audited recordings, half of them held out; the last field tells of what the audit found.
+
+    Raises:
+        ValueError: where the audit found an error, recordings are of different models, or no window fits.
+    """
+    for recording in recordings[1:]:
+        if set(recording.columns) != set(recordings[0].columns):
+            only = set(recording.columns) ^ set(recordings[0].columns)
+            raise ValueError(
+                f"{recording.name} and {recordings[0].name} have different columns ({', '.join(sorted(only))} in one of"
+                " them alone): are they of the same system?"
+            )
+    checked = [audited(recording, model) for recording in recordings]
+    fitted, held_out, warnings = split(checked)
+    shortest = min(recording.duration for recording in [*fitted, *held_out])
+    seconds = min(WINDOW, shortest)
+    warnings += tuple(dict.fromkeys(w for recording in checked for w in recording.warnings))
+    return Data(
+        cut_windows(model, fitted, seconds, keyframe=keyframe, history=2 * LONGEST),
+        cut_windows(model, held_out, seconds, keyframe=keyframe, history=2 * LONGEST),
+        tuple(fitted),
+        tuple(held_out),
+        warnings,
+    )
+
+
+def _liveliness(recording: Recording) -> float:
+    """Root mean square rate of a recording's signals, each by its own spread [1/s]."""
+    rates = []
+    for name in recording.signals:
+        values = recording[name]
+        spread = np.nanstd(values)
+        if spread > 0:
+            rates.append(np.nanmean(np.diff(values) ** 2) / spread**2)
+    return float(np.sqrt(np.mean(rates)) / recording.period) if rates else 0.0

@@ -1,0 +1,63 @@
+"""The model with what it lacked: an MJCF that plain MuJoCo loads, and the difference to the model as given."""
+
+from __future__ import annotations
+
+import difflib
+
+import mujoco
+import numpy as np
+
+from simopt_envs.gap.hypothesis import Hypothesis
+from simopt_envs.physics.columns import CommandModel, acts_on_columns
+from simopt_envs.physics.effects.actuators import DEADBAND, actuators
+from simopt_envs.physics.effects.effect import object_name
+from simopt_envs.physics.parameters import Array, ParameterSpace
+from simopt_envs.physics.spec_writer import write_spec
+
+_LINEAR = 1  # interpolation of MuJoCo's delays
+_DIGITS = 6  # that MuJoCo writes
+_CONTEXT = 1  # lines around a change
+
+
+def repaired(hypothesis: Hypothesis, xi: Array) -> mujoco.MjSpec:
+    """The hypothesis' spec with values of its ξ (d,), those of sensors' columns apart."""
+    spec = hypothesis.spec.copy()
+    of_model = [i for i, parameter in enumerate(hypothesis.space) if not acts_on_columns(parameter)]
+    space = ParameterSpace(hypothesis.space.parameters[i] for i in of_model)
+    write_spec(spec, spec.compile(), space, xi[of_model])
+    _write_delays(spec, hypothesis, xi)
+    return spec
+
+
+def _write_delays(spec: mujoco.MjSpec, hypothesis: Hypothesis, xi: Array) -> None:
+    """Put the delays of commands into a spec, where they are nearer to one timestep than to none.
+
+    MuJoCo stores a command after it was used, so that its delays are one timestep long at least.
+    """
+    timestep = float(spec.option.timestep)
+    drives = [object_name(place) for place in actuators(hypothesis.plain.model)]
+    for drive, delay in zip(drives, CommandModel(hypothesis.space, drives).delays(xi[None])[0], strict=True):
+        for part in (drive, drive + DEADBAND):
+            actuator = spec.actuator(part)
+            if actuator is not None and delay > timestep / 2:
+                actuator.delay += max(float(delay), timestep)
+                actuator.nsample = max(actuator.nsample, int(np.ceil(actuator.delay / timestep)) + 1)
+                actuator.interp = max(actuator.interp, _LINEAR)
+
+
+def column_lines(hypothesis: Hypothesis, xi: Array) -> list[str]:
+    """What MJCF cannot hold of ξ, as lines of the observation model that a recordings' reader applies."""
+    lines = []
+    for parameter, value in zip(hypothesis.space, xi, strict=True):
+        for write in (w for w in parameter.writes if w.field.startswith("column.")):
+            lines.append(f"{write.object}: {{{write.field.removeprefix('column.')}: {value:.{_DIGITS}g}}}")
+    return lines
+
+
+def difference(given: mujoco.MjSpec, spec: mujoco.MjSpec, columns: list[str]) -> str:
+    """A unified diff of two specs as MuJoCo writes them, with the observation model after it."""
+    before, after = (s.to_xml().splitlines() for s in (given, spec))
+    lines = list(difflib.unified_diff(before, after, "model.xml", "model.repaired.xml", n=_CONTEXT, lineterm=""))
+    if columns:
+        lines += ["--- /dev/null", "+++ columns.yaml", f"@@ -0,0 +1,{len(columns)} @@", *(f"+{c}" for c in columns)]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,206 @@
+"""What the gap workflow found, as numbers, files and a page."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import mujoco
+import numpy as np
+
+from simopt_envs.gap.confusion import Partner, partners
+from simopt_envs.gap.describe import Description
+from simopt_envs.gap.error import Errors
+from simopt_envs.gap.hypothesis import Candidate
+from simopt_envs.gap.localise import Row
+from simopt_envs.gap.repair import column_lines, difference, repaired
+from simopt_envs.gap.search import Data, Explanation
+from simopt_envs.gap.thresholds import EXPLAINED, LEAST_SHARE
+from simopt_envs.measured.recording import Finding
+from simopt_envs.physics.parameters import Array
+
+Verdict = Literal["named", "partly", "none", "unexplained"]
+_NORMAL_95 = 1.96
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A parameter's value, unit and 95 % interval."""
+
+    value: float
+    unit: str
+    interval95: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Named:
+    """An effect that the model lacks.
+
+    Attributes:
+        candidate: the effect and its place.
+        parameters: its numbers by their short names.
+        evidence: nats that it earned, ``"fitted"`` and ``"held_out"``.
+        partners: effects that these data hardly tell from it.
+    """
+
+    candidate: Candidate
+    parameters: dict[str, Estimate]
+    evidence: dict[str, float]
+    partners: tuple[Partner, ...]
+
+    def __str__(self) -> str:
+        numbers = ", ".join(
+            f"{name} {e.value:.3g} {e.unit} [{e.interval95[0]:.3g}, {e.interval95[1]:.3g}]"
+            for name, e in self.parameters.items()
+        )
+        return f"{self.candidate}: {numbers}"
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Where a model and recordings disagree, what is missing, and the model with it.
+
+    Attributes:
+        verdict: ``"named"``, ``"partly"``, ``"none"`` or ``"unexplained"``.
+        effects: what is missing.
+        errors: on recordings that no fit saw.
+        localisation: where the refitted model and the recordings disagree, largest share first.
+        left: what the part that is not explained depends on.
+        explanation: the search behind it.
+        data: the recordings.
+        spec: the repaired model.
+        diff: its difference to the model as given.
+        seconds: that it took.
+    """
+
+    verdict: Verdict
+    effects: tuple[Named, ...]
+    errors: Errors
+    localisation: tuple[Row, ...]
+    left: Description
+    explanation: Explanation
+    data: Data
+    spec: mujoco.MjSpec
+    diff: str
+    seconds: float
+
+    @property
+    def warnings(self) -> tuple[Finding, ...]:
+        """Of the recordings' audit."""
+        return self.data.warnings
+
+    def __str__(self) -> str:
+        numbers = f"held-out error {self.errors.refit:.3g} -> {self.errors.after:.3g}"
+        numbers += f" (model as given {self.errors.before:.3g}, noise floor {self.errors.noise_floor:.3g})"
+        return "\n".join([self.verdict, *(f"  {effect}" for effect in self.effects), f"  {numbers}"])
+
+    def to_dict(self) -> dict[str, Any]:
+        """As in ``gap.json``."""
+        first = self.explanation.stages[0]
+        return {
+            "verdict": self.verdict,
+            "effects": [
+                {
+                    "effect": named.candidate.effect.name,
+                    "where": named.candidate.place,
+                    "parameters": {
+                        name: {"value": e.value, "unit": e.unit, "interval95": list(e.interval95)}
+                        for name, e in named.parameters.items()
+                    },
+                    "evidence": named.evidence,
+                    "confounded_with": [
+                        {"effect": p.candidate.effect.name, "where": p.candidate.place, "correlation": p.correlation}
+                        for p in named.partners
+                    ],
+                }
+                for named in self.effects
+            ],
+            "candidates": [
+                {
+                    "effect": score.candidate.effect.name,
+                    "where": score.candidate.place,
+                    "held_out_gap": 1.0 + score.trial.excess,
+                    "evidence": {"fitted": score.fitted, "held_out": score.held_out},
+                }
+                for score in first.scores
+            ],
+            "gap": {
+                "metric": "normalised RMSE",
+                "before": self.errors.before,
+                "refit": self.errors.refit,
+                "after": self.errors.after,
+                "interval95": list(self.errors.interval95),
+                "noise_floor": self.errors.noise_floor,
+                "held_out": [recording.name for recording in self.data.held_out_recordings],
+            },
+            "localisation": [
+                {"channel": row.channel, "regime": row.regime, "share": row.share, "z": row.z}
+                for row in self.localisation
+            ],
+            "unexplained": self.left.text,
+            "warnings": [str(warning) for warning in self.warnings],
+            "model": "model.repaired.xml",
+            "diff": "model.diff",
+            "seconds": self.seconds,
+        }
+
+    def save(self, folder: str | Path) -> Path:
+        """Write ``gap.json``, ``model.repaired.xml``, ``model.diff`` and the report with its plots into a folder.
+
+        Raises:
+            ImportError: without what the report needs, after all else is written.
+        """
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "model.repaired.xml").write_text(self.spec.to_xml())
+        (folder / "model.diff").write_text(self.diff)
+        (folder / "gap.json").write_text(json.dumps(self.to_dict(), indent=1))
+        try:
+            from simopt_envs.gap.report import write_report
+        except ImportError as error:
+            raise ImportError('the report needs more packages: pip install "simopt-envs[report]"') from error
+        write_report(self, folder, self.localisation, self.left)
+        return folder
+
+
+def judge(explanation: Explanation) -> Verdict:
+    """The verdict on a search, from what is left on recordings that no fit saw."""
+    left, right = explanation.final.excess, EXPLAINED - 1
+    if not explanation.effects:
+        return "none" if left < right else "unexplained"
+    if left < right:
+        return "named"
+    return "partly" if left < (1 - LEAST_SHARE) * explanation.null.excess else "unexplained"
+
+
+def named_effects(explanation: Explanation) -> tuple[Named, ...]:
+    """The effects that a search found, with what it knows of their numbers."""
+    final = explanation.final
+    hypothesis, u = final.hypothesis, final.fit.u
+    spread = np.sqrt(np.diag(final.fit.covariance()) * max(1.0, 1.0 + final.excess))
+    ends = u + _NORMAL_95 * np.array([-spread, spread])
+    xi, (low, high) = hypothesis.xi(u[None])[0], hypothesis.xi(ends)
+    scores = {score.candidate: score for stage in explanation.stages for score in stage.scores}
+    return tuple(
+        Named(
+            candidate,
+            {
+                hypothesis.space.names[i].removeprefix(candidate.full_name("")): Estimate(
+                    float(xi[i]), hypothesis.space.units[i], (float(low[i]), float(high[i]))
+                )
+                for i in columns
+            },
+            {"fitted": scores[candidate].fitted, "held_out": scores[candidate].held_out},
+            partners(explanation, candidate),
+        )
+        for candidate, columns in hypothesis.columns.items()
+    )
+
+
+def repair(explanation: Explanation, given: mujoco.MjSpec, xi: Array) -> tuple[mujoco.MjSpec, str]:
+    """The repaired spec and its difference to the one given."""
+    hypothesis = explanation.final.hypothesis
+    spec = repaired(hypothesis, xi)
+    return spec, difference(given, spec, column_lines(hypothesis, xi))

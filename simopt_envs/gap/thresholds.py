@@ -1,0 +1,34 @@
+"""Every threshold of the gap workflow, in one place, so that a change of one is a change of this file.
+
+They were set on the development seeds of ``benchmarks/hidden_effects`` and frozen before its test seeds were first run.
+"""
+
+EVIDENCE = 20.0
+"""Nats that an effect must earn both on the windows fitted and on those held out."""
+
+EXPLAINED = 1.25
+"""Mean square of the whitened errors up to which a model counts as right; noise alone leaves 1."""
+
+SIMPLER = 5.0
+"""Nats by which a candidate with more parameters must win, both fitted and held out, over one with fewer."""
+
+FURTHER = 0.02
+"""Share of the held-out excess removed so far that a further effect must add, once the model counts as right."""
+
+LEAST_SHARE = 0.6
+"""Share of the held-out excess that the effects must take away, or the gap is unexplained."""
+
+FAR = 3.5
+"""Standard deviations from its prior's mean from which a plain parameter speaks for an effect."""
+
+REFITTED = 6
+"""Candidates of the screen that are fitted."""
+
+MOST_EFFECTS = 4
+"""Effects that are looked for at once."""
+
+CONFOUNDED = 0.9
+"""Correlation of what two effects change, plain parameters projected out, from which they are called confounded."""
+
+WINDOW = 0.5
+"""Seconds of a window."""

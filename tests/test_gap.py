@@ -1,0 +1,113 @@
+"""The gap workflow on a system whose hidden law shares no code with the library."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+from gap_plant import MODEL, record
+
+from simopt_envs.gap import find_gap
+from simopt_envs.measured import cut_windows, simulate_windows
+from simopt_envs.physics.effects import EFFECTS
+
+pytest.importorskip("mujoco.batch")
+
+FEW = [
+    EFFECTS[name]
+    for name in (
+        "coulomb_friction",
+        "viscous_friction",
+        "quadratic_drag",
+        "actuator_delay",
+        "actuator_bias",
+        "payload",
+        "gravity_compensation",
+        "sensor_bias",
+        "joint_spring",
+    )
+]
+
+
+def spec() -> mujoco.MjSpec:
+    return mujoco.MjSpec.from_string(MODEL)
+
+
+@pytest.fixture(scope="module")
+def friction_gap():
+    recordings = record(lambda q, v: np.array([0.0, -0.4 * np.tanh(v[1] / 0.01)]), np.random.default_rng(1))
+    return find_gap(spec(), recordings, effects=FEW)
+
+
+def test_hidden_friction_is_named_at_its_joint_with_its_size(friction_gap):
+    assert friction_gap.verdict == "named"
+    (named,) = friction_gap.effects
+    assert (named.candidate.effect.name, named.candidate.place) == ("coulomb_friction", "joint:elbow")
+    assert named.parameters["frictionloss"].value == pytest.approx(0.4, rel=0.05)
+    errors = friction_gap.errors
+    assert errors.after < 1.1 * errors.noise_floor < errors.refit < errors.before
+
+
+def test_a_right_model_with_wrong_plain_parameters_lacks_nothing():
+    gap = find_gap(spec(), record(lambda q, v: np.zeros(2), np.random.default_rng(2)), effects=FEW)
+    assert gap.verdict == "none"
+    assert gap.effects == ()
+    assert gap.errors.refit < 1.1 * gap.errors.noise_floor < gap.errors.before
+
+
+def test_the_constant_force_of_a_drive_is_told_from_friction():
+    recordings = record(lambda q, v: np.array([0.4, 0.0]), np.random.default_rng(3))
+    gap = find_gap(spec(), recordings, effects=FEW)
+    first = gap.effects[0]
+    alike = {first.candidate.effect.name, *(p.candidate.effect.name for p in first.partners)}
+    assert "actuator_bias" in alike
+    assert "coulomb_friction" not in {named.candidate.effect.name for named in gap.effects}
+
+
+def test_the_repaired_model_is_plain_mujoco_and_predicts_what_the_workflow_says(friction_gap, tmp_path):
+    folder = friction_gap.save(tmp_path / "out")
+    repaired = mujoco.MjModel.from_xml_path(str(folder / "model.repaired.xml"))
+    assert repaired.joint("elbow").frictionloss[0] > 0.1
+    windows = cut_windows(repaired, friction_gap.data.held_out_recordings, 0.5)
+    # MJCF has no delay below one timestep, and six digits: the same to a fraction of the noise.
+    error = simulate_windows(repaired, windows)[0] - friction_gap.errors.simulated[2]
+    assert np.sqrt(np.mean(error[..., :2] ** 2)) < 4e-3  # of a spread of 0.4 rad
+    changed = [line for line in (folder / "model.diff").read_text().splitlines() if line.startswith("+ ")]
+    assert any("frictionloss" in line for line in changed)
+    assert len(changed) <= 6
+
+
+def test_the_files_say_what_the_contract_promises(friction_gap, tmp_path):
+    found = json.loads((friction_gap.save(tmp_path / "out") / "gap.json").read_text())
+    assert set(found) >= {"verdict", "effects", "candidates", "gap", "localisation", "model", "diff"}
+    assert found["gap"]["metric"] == "normalised RMSE"
+    assert found["gap"]["interval95"][0] <= found["gap"]["after"] <= found["gap"]["interval95"][1]
+    estimate = found["effects"][0]["parameters"]["frictionloss"]
+    assert estimate["interval95"][0] < estimate["value"] < estimate["interval95"][1]
+    assert estimate["unit"] == "N m"
+    held_out = [candidate["evidence"]["held_out"] for candidate in found["candidates"]]
+    assert held_out[0] == max(held_out)
+
+
+def test_what_cannot_be_searched_is_said_before_any_work():
+    recordings = record(lambda q, v: np.zeros(2), np.random.default_rng(4), count=2, seconds=1.0)
+    with pytest.raises(ValueError, match="at least one recording"):
+        find_gap(spec(), [])
+    with pytest.raises(FileNotFoundError, match=r"nothing\.xml"):
+        find_gap("nothing.xml", recordings)
+    other = replace(recordings[1], columns={n: v for n, v in recordings[1].columns.items() if n != "qpos/elbow"})
+    with pytest.raises(ValueError, match="different columns"):
+        find_gap(spec(), [recordings[0], other])
+    broken = replace(recordings[0], columns={**recordings[0].columns, "ctrl/elbow": np.full(51, np.nan)})
+    with pytest.raises(ValueError, match="ctrl/elbow"):
+        find_gap(spec(), [broken, recordings[1]])
+
+
+def test_one_recording_is_split_in_time_and_said_to_be(friction_gap):
+    (one,) = record(lambda q, v: np.zeros(2), np.random.default_rng(5), count=1, seconds=4.0)
+    gap = find_gap(spec(), [one], effects=FEW[:2])
+    assert any("one recording only" in str(warning) for warning in gap.warnings)
+    assert gap.data.fitted_recordings[0].time[-1] < gap.data.held_out_recordings[0].time[0]

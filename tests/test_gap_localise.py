@@ -1,0 +1,117 @@
+"""Where errors are: shares, lifts and z-scores of channels and regimes."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from simopt_envs.gap.circumstances import Circumstances, circumstances
+from simopt_envs.gap.localise import EVERYWHERE, Partition, localise, partitions, tabulate
+from simopt_envs.measured import cut_windows
+from simopt_envs.measured.recording import Recording
+
+CHANNELS = ("qpos/a", "qpos/b", "qpos/c")
+SLIDER = """
+<mujoco><option timestep="0.005" gravity="0 0 0"/><worldbody>
+  <body><joint name="slide" type="slide" axis="1 0 0"/><geom size="0.1" mass="1" contype="0" conaffinity="0"/></body>
+</worldbody><actuator><position name="drive" joint="slide" kp="100" kv="20"/></actuator></mujoco>
+"""
+
+
+def sliding(windows=24, samples=26, period=0.02):
+    """The circumstances of one joint on a sine of 1 Hz, with a command step in each window."""
+    time = np.arange(windows * samples).reshape(windows, samples) * period
+    phase = 2 * np.pi * time
+    command = np.where(np.arange(samples) < 13, 0.0, 1.0) * np.ones((windows, 1))
+    return Circumstances(
+        joints=("slide",),
+        actuators=("drive",),
+        position=np.sin(phase)[..., None],
+        velocity=2 * np.pi * np.cos(phase)[..., None],
+        acceleration=-4 * np.pi**2 * np.sin(phase)[..., None],
+        load=np.cos(3 * phase)[..., None],
+        command=command[..., None],
+        contact=np.zeros(time.shape, dtype=bool),
+        time=time,
+        period=period,
+    )
+
+
+def rows_of(errors, around):
+    return tabulate(CHANNELS[: errors.shape[2]], errors, np.ones(errors.shape, dtype=bool), partitions(around))
+
+
+def test_shares_of_a_partition_sum_to_one():
+    around = sliding()
+    rows = rows_of(np.random.default_rng(0).standard_normal((24, 26, 3)), around)
+    totals: dict[str, float] = {}
+    for row in rows:
+        partition = row.regime.split(": ")[0]
+        totals[partition] = totals.get(partition, 0.0) + row.share
+    assert {"all", "speed of slide", "position of slide", "command", "time in the recording"} <= set(totals)
+    assert "contact" not in totals  # nothing ever touches: there is nothing to tell apart
+    assert list(totals.values()) == pytest.approx([1.0] * len(totals))
+    assert [row.share for row in rows] == sorted((row.share for row in rows), reverse=True)
+
+
+def test_scores_are_standard_normal_without_a_gap():
+    """Noise whose size was estimated, as a search does, from second differences of as many samples."""
+    rng, around, z = np.random.default_rng(1), sliding(), []
+    for _ in range(40):
+        noise = rng.standard_normal((24, 26, 3))
+        scale = np.sqrt(np.mean(np.diff(noise, n=2, axis=1) ** 2, axis=(0, 1)) / 6)
+        z += [row.z for row in rows_of(rng.standard_normal(noise.shape) / scale, around)]
+    assert abs(np.mean(z)) < 0.25
+    assert 0.8 < np.std(z) < 1.15
+    assert np.mean(np.abs(z) > 3) < 0.01
+
+
+def test_finds_the_channel_and_the_regime():
+    rng, around = np.random.default_rng(2), sliding()
+    errors = rng.standard_normal((24, 26, 3))
+    fast = np.abs(around.velocity[..., 0]) > 5.0
+    errors[..., 1] += 3.0 * fast
+    rows = {(row.channel, row.regime): row for row in rows_of(errors, around)}
+    assert next(iter(rows)) == ("qpos/b", EVERYWHERE)
+    high, low = (rows["qpos/b", f"speed of slide: {part}"] for part in ("high", "low"))
+    assert high.z > 8
+    assert high.lift > 1.5
+    assert abs(low.z) < 4
+    assert low.lift < 0.5
+    assert all(abs(row.z) < 4 for (channel, _), row in rows.items() if channel != "qpos/b")
+
+
+def test_errors_of_one_window_are_not_taken_for_many():
+    """Sixteen samples that go together in each window scatter as much as one: no z beyond chance."""
+    rng, z = np.random.default_rng(3), []
+    everywhere = [Partition(EVERYWHERE, {"": np.ones((24, 16), dtype=bool)})]
+    for _ in range(200):
+        errors = np.repeat(rng.standard_normal((24, 1, 1)), 16, axis=1)
+        z += [row.z for row in tabulate(["x"], errors, np.ones(errors.shape, dtype=bool), everywhere)]
+    assert 0.7 < np.std(z) < 1.6
+    assert np.mean(np.array(z) > 3) < 0.01
+
+
+def test_reversals_holds_and_steps():
+    around = sliding(windows=1, samples=100)
+    still = Circumstances(**{**vars(around), "velocity": np.where(around.time[..., None] < 0.5, 0.0, around.velocity)})
+    assert still.held()[0, :25].all()
+    assert not still.held()[0, 26:].any()
+    assert not around.held().any()  # it turns round, and never stays
+    turns = np.flatnonzero(np.diff(around.direction()[0, :, 0]))
+    assert turns * around.period == pytest.approx([0.25, 0.75, 1.25, 1.75], abs=0.03)
+    assert np.flatnonzero(around.stepped()[0]).tolist() == [13]
+
+
+def test_follows_measured_joints_and_simulates_the_others():
+    model = mujoco.MjModel.from_xml_string(SLIDER)
+    time = np.arange(0, 4, 0.02)
+    columns = {"ctrl/drive": np.zeros_like(time), "qpos/slide": np.sin(3 * time)}
+    windows = cut_windows(model, Recording(time, columns, "sine"), 0.5)
+    around = circumstances(model, windows)
+    inner = slice(3, -3)  # where the polynomials are centred
+    assert around.position[:, inner, 0] == pytest.approx(np.sin(3 * around.time)[:, inner], abs=1e-3)
+    assert around.velocity[:, inner, 0] == pytest.approx(3 * np.cos(3 * around.time)[:, inner], abs=0.05)
+    force = -100 * around.position - 20 * around.velocity
+    assert around.load == pytest.approx(force, abs=1e-9)
+    rows = localise(windows, np.zeros(windows.measured.shape), model)
+    assert {row.channel for row in rows} == {"qpos/slide"}

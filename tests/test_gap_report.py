@@ -1,0 +1,132 @@
+"""The figures of a gap report, and the page."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from simopt_envs.gap.describe import Curve
+from simopt_envs.gap.figures import candidates_figure, curve_figure, error_figure, overlay_figure, regime_figure
+from simopt_envs.gap.localise import Partition, Row, tabulate
+from simopt_envs.gap.report import diff, effects, table, warnings
+from simopt_envs.measured.channels import Channel
+from simopt_envs.measured.states import States
+from simopt_envs.measured.windows import Windows
+from simopt_envs.report.figures import save_figure
+from simopt_envs.report.page import write_page
+
+RNG = np.random.default_rng(0)
+WINDOWS, SAMPLES = 6, 20
+
+
+@pytest.fixture
+def windows():
+    """Two recordings of three windows of a joint that moves and one that stands."""
+    time = np.arange(SAMPLES) * 0.02
+    starts = np.tile([0.0, 0.5, 1.0], 2)
+    moves = np.sin(starts[:, None] + time)
+    noise = 1e-3 * RNG.standard_normal((WINDOWS, SAMPLES, 2))
+    return Windows(
+        channels=tuple(Channel(f"qpos/{name}", "qpos", i, i, "rad") for i, name in enumerate(("elbow", "locked"))),
+        offsets=time,
+        start_time=starts,
+        recording=("a",) * 3 + ("b",) * 3,
+        measured=np.stack([moves, np.zeros_like(moves)], axis=-1) + noise,
+        commands=np.zeros((WINDOWS, SAMPLES - 1, 0)),
+        past_commands=np.zeros((WINDOWS, 1, 0)),
+        starts=States(*(np.zeros((WINDOWS, 2)) for _ in range(4))),
+        stride=1,
+    )
+
+
+def test_overlays_show_channels_that_move(windows):
+    simulated = [windows.measured + offset for offset in (0.1, 0.05, 0.0)]
+    figure = overlay_figure(windows, simulated, np.full(2, 1e-3))
+    assert [axis.get_ylabel() for axis in figure.axes] == ["qpos/elbow [rad]", ""]
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert labels == ["measured", "as given", "refitted", "repaired"]
+    errors = [line for line in figure.axes[1].lines if line.get_label() == "repaired"]
+    assert all(np.allclose(line.get_ydata(), 0.0) for line in errors)
+
+
+def test_regimes_are_blank_within_the_noise():
+    late = np.zeros((24, SAMPLES), dtype=bool)
+    late[:, SAMPLES // 2 :] = True
+    errors = RNG.standard_normal((24, SAMPLES, 2))
+    errors[..., 0] += 4.0 * late
+    parts = [Partition("all", {"": np.ones_like(late)}), Partition("time in it", {"early": ~late, "late": late})]
+    rows = tabulate(["qpos/elbow", "qpos/wrist"], errors, np.ones(errors.shape, dtype=bool), parts)
+    bars, cells = regime_figure(rows).axes[:2]
+    assert [label.get_text() for label in bars.get_yticklabels()] == ["qpos/elbow", "qpos/wrist"]
+    assert [label.get_text() for label in cells.get_xticklabels()] == ["early", "late"]
+    shown = cells.images[0].get_array()
+    assert np.isfinite(shown.filled(np.nan)[0, 1])
+    assert np.isnan(shown.filled(np.nan)[:, 0]).all()
+
+
+def test_regimes_of_a_model_without_any():
+    assert regime_figure([Row("qpos/elbow", "all", 1.0, 1.0, 0.3)]).axes
+
+
+@pytest.mark.parametrize("values", [(0.4, 0.2, 0.05), (40.0, 0.2, 0.05), (0.4, 0.2)])
+def test_errors_with_their_noise_floor(tmp_path, values):
+    figure = error_figure(values, [(0.9 * v, 1.1 * v) for v in values], 0.04)
+    axis = figure.axes[0]
+    assert [label.get_text() for label in axis.get_yticklabels()] == ["as given", "refitted", "repaired"][: len(values)]
+    assert axis.get_xscale() == ("log" if values[0] > 1 else "linear")
+    assert "noise floor 0.04" in axis.get_legend_handles_labels()[1]
+    assert save_figure(figure, tmp_path / "errors.png").stat().st_size > 5000
+
+
+def test_candidates_and_curve(tmp_path):
+    figure = candidates_figure(["one", "two"], [500.0, -3.0], [80.0, -50.0], 20.0)
+    assert [bar.get_width() for bar in figure.axes[0].patches] == [500.0, -3.0, 80.0, -50.0]
+    assert save_figure(figure, tmp_path / "candidates.png").exists()
+    x = np.linspace(-1, 1, 30)
+    curve = Curve("force on elbow", "N m", "velocity of elbow", "rad/s", 0.9, x, x**3, np.tile(x**3, (4, 1)))
+    axis = curve_figure(curve).axes[0]
+    assert axis.get_ylabel() == "missing force on elbow [N m]"
+    assert len(axis.lines) == 4 + 1 + 1  # each recording, all together, zero
+
+
+@dataclass
+class Named:
+    """What the report asks of an effect."""
+
+    candidate: object
+    parameters: dict
+    partners: tuple
+
+
+@dataclass
+class Thing:
+    """Any object with some attributes."""
+
+    def __init__(self, text="", **attributes):
+        self.text = text
+        self.__dict__.update(attributes)
+
+    def __str__(self):
+        return self.text
+
+
+def test_sections_say_it_in_html(tmp_path):
+    coulomb = Thing(effect=Thing(name="coulomb_friction", law="f = -F sign(v)"), place="joint:elbow")
+    estimate = Thing(value=0.208, unit="N m", interval95=(0.201, 0.216))
+    partner = Thing(candidate=Thing("deadband at actuator:e"), correlation=0.93, behind=12.0)
+    named = Named(coulomb, {"frictionloss": estimate}, (partner,))
+    sections = [
+        *effects([named], {"deadband at actuator:e": "reverse slowly"}),
+        diff("--- a\n+++ b\n@@ -1 +1 @@\n-<joint/>\n+<joint frictionloss='0.2'/>\n"),
+        *warnings(["qpos/elbow: gaps"]),
+        table("Empty", ("a", "b"), [], hint="nothing moved"),
+    ]
+    page = write_page(tmp_path / "report.html", "title", "subtitle", sections).read_text()
+    for text in ("coulomb_friction at joint:elbow", "0.201 … 0.216", "f = -F sign(v)", "12 nats behind"):
+        assert text in page
+    assert "deadband at actuator:e</code> (correlation 0.93, 12 nats behind): reverse slowly" in page
+    assert "&lt;joint frictionloss=&#39;0.2&#39;/&gt;" in page
+    assert "qpos/elbow: gaps" in page
+    assert "nothing moved" in page
+    assert list(effects([], {})) == []
+    assert list(warnings([])) == []
