@@ -50,20 +50,20 @@ class PPOConfig:
     """Arguments of the algorithm; the defaults train the tasks of `simopt_envs` in about a minute.
 
     Raises:
-        ValueError: A count that is not positive, or as many evaluation worlds as worlds.
+        ValueError: A count that is not positive, or an evaluation share outside [0, 1).
     """
 
-    num_envs: int = 32
+    num_envs: int = 64
     """Worlds stepped side by side."""
     num_steps: int = 50
     """Control steps of every world in one iteration; whole episodes, where all worlds end theirs together."""
-    iterations: int = 200
-    """Iterations (rollout and update) of a training from scratch."""
-    warm_start_iterations: int = 125
-    """Iterations of a training that continues from a given policy."""
+    iterations: int = 300
+    """Most iterations (rollout and update) of a training from scratch."""
+    warm_start_iterations: int = 150
+    """Most iterations of a training that continues from a given policy."""
     epochs: int = 10
     """Passes over the batch in one update."""
-    minibatches: int = 3
+    minibatches: int = 5
     """Gradient steps in one pass."""
     gamma: float = 0.98
     """Discount factor."""
@@ -90,23 +90,24 @@ class PPOConfig:
     """Width of the two hidden layers of the actor, and of those of the critic."""
     initial_log_std: float = -0.3
     """Logarithm of the exploration noise at the start, where the action range is ±1."""
-    warm_start_log_std: float = -0.3
-    """A training that continues from a given policy begins with at least this much."""
-    success_stop: float | None = None
-    """Training ends early at this success rate (mean of `info["is_success"]` at episode ends)."""
-    evaluation_envs: int = 8
-    """With `success_stop`: so many worlds act without noise and are measured instead of learned from."""
-    evaluation_episodes: int = 32
-    """With `success_stop`: the success rate is that of the last so many measured episodes."""
+    stuck_iterations: int = 15
+    """A training that continues from a given policy keeps its exploration noise, as more of it may ruin what the
+    policy can do. If no episode of the first so many iterations succeeds, there is nothing to ruin."""
+    stuck_log_std: float = -0.3
+    """Exploration noise is then raised to at least this."""
+    success_stop: float | None = 0.97
+    """Training ends early at this success rate (mean of `info["is_success"]` at episode ends, where the env has it)."""
+    evaluation_share: float = 0.125
+    """This share of the worlds, rounded down, acts without noise and is measured instead of learned from."""
+    evaluation_episodes: int = 64
+    """Return and success are those of the last so many measured episodes; without a share, of those learned from."""
 
     def __post_init__(self) -> None:
-        for name in ("num_envs", "num_steps", "epochs", "minibatches", "hidden", "evaluation_envs"):
+        for name in ("num_envs", "num_steps", "epochs", "minibatches", "hidden", "evaluation_episodes"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if self.success_stop is not None and self.evaluation_envs >= self.num_envs:
-            raise ValueError(
-                f"evaluation_envs={self.evaluation_envs} leaves none of num_envs={self.num_envs} to learn from"
-            )
+        if not 0 <= self.evaluation_share < 1:
+            raise ValueError(f"evaluation_share must be within [0, 1), got {self.evaluation_share}")
 
 
 @dataclass(frozen=True)
@@ -118,11 +119,11 @@ class Progress:
     total_steps: int
     """Control steps of the whole training, if it does not stop early."""
     episode_return: float
-    """Mean undiscounted return of the last episodes (without noise, with `success_stop`); NaN before the first."""
+    """Mean undiscounted return of the last measured episodes; NaN before the first."""
     success: float
     """Mean success at the end of the same episodes; NaN where the env reports none."""
     kl: float
-    """KL divergence of the last update."""
+    """KL divergence of the last update; NaN before the first."""
     learning_rate: float
     """Step size of Adam for the next update."""
     seconds: float
@@ -285,6 +286,7 @@ class Collector:
 
     Attributes:
         episodes: (return, success) of the last episodes; success is NaN where the env reports none.
+        best_success: The best success of any episode, with or without noise; NaN where the env reports none.
 
     Raises:
         ValueError: The env does not say that it resets its worlds by itself.
@@ -302,6 +304,7 @@ class Collector:
         self.exploring = np.arange(env.num_envs) < env.num_envs - evaluation_envs
         self.measured = ~self.exploring if evaluation_envs else self.exploring
         self.episodes: deque[tuple[float, float]] = deque(maxlen=window)
+        self.best_success = float("nan")
         self._observation = np.array(env.reset(seed=seed)[0], dtype=np.float64)
         self._return = np.zeros(env.num_envs)
         self._resets_next = np.zeros(env.num_envs, dtype=bool)
@@ -339,6 +342,7 @@ class Collector:
             success = infos.get("final_info", infos).get("is_success", np.full(len(done), np.nan))
             for world in np.flatnonzero(done & self.measured):
                 self.episodes.append((float(self._return[world]), float(success[world])))
+            self.best_success = float(np.fmax(self.best_success, np.max(success[done])))
             self._return[done] = 0.0
 
     def score(self) -> tuple[float, float]:
@@ -489,35 +493,41 @@ class TorchPPO:
 
         Raises:
             ValueError: The env does not reset by itself, does not fit the policy, gives numbers that are not
-                finite, or reports no `info["is_success"]` although `success_stop` is set.
+                finite.
             TypeError: An observation or action space that is not a one-dimensional `Box`.
         """
         with closing(make_vector_env(self.config.num_envs)) as env, one_torch_thread():
             return self._train(env, policy, rng)
 
     def _train(self, env: VectorEnv, policy: TorchPolicy | None, rng: np.random.Generator) -> TorchPolicy:
-        config, start = self.config, time.perf_counter()
-        iterations = config.iterations if policy is None else config.warm_start_iterations
+        config, start, warm = self.config, time.perf_counter(), policy is not None
+        iterations = config.warm_start_iterations if warm else config.iterations
         steps_per_iteration = config.num_envs * config.num_steps
         generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
         policy = _starting_policy(env, policy, config, generator)
         optimizer = torch.optim.Adam(policy.parameters(), lr=config.learning_rate, fused=True)
         if policy.optimizer_state:
             optimizer.load_state_dict(policy.optimizer_state)
-        evaluation_envs = config.evaluation_envs if config.success_stop is not None else 0
+        evaluation_envs = int(config.evaluation_share * config.num_envs)
         collector = Collector(env, int(rng.integers(2**31)), evaluation_envs, config.evaluation_episodes)
 
+        kl = float("nan")
         for iteration in range(1, iterations + 1):
             noise = torch.randn((config.num_steps, config.num_envs, len(policy.log_std)), generator=generator)
-            batch = prepare(policy, collector.collect(policy, noise), config)
-            kl = update(policy, optimizer, batch, config, generator)
-            for group in optimizer.param_groups:
-                group["lr"] = adapted_learning_rate(group["lr"], kl, config)
-            policy.optimizer_state = optimizer.state_dict()
+            rollout = collector.collect(policy, noise)
             policy.steps_trained += steps_per_iteration
+            episode_return, success = collector.score()
+            measured_enough = len(collector.episodes) == config.evaluation_episodes
+            solved = config.success_stop is not None and measured_enough and success >= config.success_stop
+            if not solved:  # else the policy stays what was measured: a single update can undo much
+                kl = update(policy, optimizer, prepare(policy, rollout, config), config, generator)
+                for group in optimizer.param_groups:
+                    group["lr"] = adapted_learning_rate(group["lr"], kl, config)
+                if warm and iteration == config.stuck_iterations and collector.best_success == 0.0:
+                    policy.log_std.data.clamp_(min=config.stuck_log_std)
+                policy.optimizer_state = optimizer.state_dict()
             if self.checkpoint is not None:
                 self.save(policy, self.checkpoint)
-            episode_return, success = collector.score()
             if self.on_progress is not None:
                 self.on_progress(
                     Progress(
@@ -530,11 +540,8 @@ class TorchPPO:
                         seconds=time.perf_counter() - start,
                     )
                 )
-            if config.success_stop is not None and len(collector.episodes) == config.evaluation_episodes:
-                if np.isnan(success):
-                    raise ValueError(f"success_stop={config.success_stop} needs info['is_success'], which {env} lacks")
-                if success >= config.success_stop:
-                    break
+            if solved:
+                break
         return policy
 
     def save(self, policy: TorchPolicy, path: Path) -> None:
@@ -606,9 +613,7 @@ def _starting_policy(
             f"the given policy is for (observation size, action low, action high) {given}, "
             f"{env} has {(observation_size, low, high)}"
         )
-    policy = copy.deepcopy(policy)
-    policy.log_std.data.clamp_(min=config.warm_start_log_std)
-    return policy
+    return copy.deepcopy(policy)
 
 
 def evaluate(policy: TorchPolicy, env: VectorEnv, seed: int) -> Array:

@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,8 @@ import gymnasium as gym
 import numpy as np
 import tyro
 from gymnasium.vector import AutoresetMode, VectorEnv
+from matplotlib.figure import Figure
+from matplotlib.ticker import PercentFormatter
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
@@ -29,10 +31,12 @@ from rich.table import Table
 from scipy.interpolate import CubicSpline
 
 import simopt_envs  # noqa: F401 - registers the environments
-from baselines.ppo_torch import PPOConfig, Progress, TorchPolicy, TorchPPO
+from baselines.commands.inputs import distribution
+from baselines.ppo_torch import TorchPolicy, TorchPPO
 from simopt_envs.distributions import Gaussian
 from simopt_envs.physics import ParameterSpace
 from simopt_envs.physics.simulation import SingleSimulation
+from simopt_envs.report.figures import BLUE, GREY, save_figure, styled
 from simopt_envs.tasks.arm import JOINTS
 from simopt_envs.tasks.env import TaskEnv
 from simopt_envs.tasks.swingpeg import make_env
@@ -41,18 +45,7 @@ from wrappers import DistributionVectorWrapper
 Array = NDArray[np.float64]
 ENV_ID = "SimOpt/SwingPeg-v0"
 HORIZON = 50
-MODEST = {
-    "joint_gain_*": 0.03,
-    "joint_damping_*": 0.03,
-    "action_scaling_*": 0.01,
-    "rope_segment_length": 0.02,
-    "rope_bending_*": 0.1,
-    "rope_density": 0.05,
-    "peg_mass": 0.05,
-    "peg_friction": 0.1,
-    "box_friction": 0.1,
-}
-"""Standard deviations of the initial distribution, relative to nominal."""
+COLUMNS = 6  # of panels in the figure
 
 
 @dataclass
@@ -65,8 +58,6 @@ class Args:
     """Holds the policy and the figures."""
     seed: int = 0
     """Of everything random."""
-    iterations: int = 312
-    """Most iterations of the training, 3200 steps each."""
     values: int = 9
     """Values of each parameter in its success curve."""
     episodes: int = 32
@@ -75,16 +66,11 @@ class Args:
     """Episodes of the stability run."""
 
 
-def initial_distribution(space: ParameterSpace, widening: float = 1.0) -> Gaussian:
-    """The modest randomization, its standard deviations times ``widening``."""
-    stds = {n: s for pattern, s in MODEST.items() for n in space.names if fnmatchcase(n, pattern)}
-    return Gaussian.around_nominal(space.subset(list(stds)), widening * np.array(list(stds.values())))
-
-
 def make_vector_env(num_envs: int, widening: float = 1.0) -> VectorEnv:
-    """Worlds whose ξ is drawn at every episode."""
+    """Worlds with a ξ drawn at every episode from the default p(ξ), its standard deviations times ``widening``."""
     env: Any = gym.make_vec(ENV_ID, num_envs=num_envs, autoreset_mode=AutoresetMode.SAME_STEP)
-    return DistributionVectorWrapper(env, initial_distribution(env.unwrapped.parameters, widening))
+    p = distribution(ENV_ID, env.unwrapped.parameters, ())
+    return DistributionVectorWrapper(env, Gaussian(p.space, p.mean, widening**2 * p.covariance))
 
 
 def success(policy: TorchPolicy, parameters: Array, seed: int) -> NDArray[np.bool_]:
@@ -98,19 +84,11 @@ def success(policy: TorchPolicy, parameters: Array, seed: int) -> NDArray[np.boo
 
 def train(args: Args) -> tuple[TorchPolicy, dict[str, float]]:
     """A policy, and what it took."""
-    figures: dict[str, float] = {}
-
-    def note(progress: Progress) -> None:
-        figures.update(steps=progress.steps, seconds=progress.seconds)
-
-    start = time.process_time()
-    config = PPOConfig(
-        num_envs=64, minibatches=4, iterations=args.iterations, success_stop=0.98, evaluation_episodes=64
-    )
-    policy = TorchPPO(config, on_progress=note, checkpoint=args.out / "policy.pt")(
-        make_vector_env, None, np.random.default_rng(args.seed)
-    )
-    return policy, figures | {"cpu_seconds": time.process_time() - start}
+    wall, cpu = time.perf_counter(), time.process_time()
+    trainer = TorchPPO(checkpoint=args.out / "policy.pt")
+    policy = trainer(make_vector_env, None, np.random.default_rng(args.seed))
+    seconds = {"wall_seconds": time.perf_counter() - wall, "cpu_seconds": time.process_time() - cpu}
+    return policy, {"steps": policy.steps_trained, **seconds}
 
 
 def joint_trajectories(policy: TorchPolicy, env: TaskEnv, episodes: int, seed: int) -> list[Array]:
@@ -165,6 +143,26 @@ def success_curves(policy: TorchPolicy, env: TaskEnv, args: Args) -> dict[str, t
     return curves
 
 
+@styled
+def curves_figure(curves: Mapping[str, tuple[Array, Array]], space: ParameterSpace) -> Figure:
+    """A panel for each parameter: success over its bounds, a line at its nominal value."""
+    rows = -(-len(curves) // COLUMNS)
+    figure = Figure(figsize=(11.0, 1.5 * rows), layout="constrained")
+    panels = figure.subplots(rows, COLUMNS, sharey=True, squeeze=False).flat
+    for (name, (values, rates)), axis in zip(curves.items(), panels, strict=False):
+        parameter = space[name]
+        axis.axvline(parameter.nominal, color=GREY, linewidth=0.8, linestyle=":")
+        axis.plot(values, rates, color=BLUE, marker=".")
+        axis.set_title(name if parameter.unit == "1" else f"{name} [{parameter.unit}]", size=8)
+        axis.set_xscale(parameter.coordinate)
+        axis.set_xticks(values[[0, -1]], [f"{value:.3g}" for value in values[[0, -1]]])
+        axis.minorticks_off()
+        axis.yaxis.set_major_formatter(PercentFormatter(1.0))
+    for axis in panels:
+        axis.set_axis_off()
+    return figure
+
+
 def diverged_episodes(args: Args, num_envs: int = 500) -> int:
     """How many of the episodes of random actions diverge."""
     env: Any = make_vector_env(num_envs, widening=3.0)
@@ -176,7 +174,7 @@ def diverged_episodes(args: Args, num_envs: int = 500) -> int:
 
 
 def main(args: Args) -> None:
-    """Measure everything, print it, and write ``figures.json``."""
+    """Measure everything, print it, write ``figures.json`` and a picture of the success curves."""
     console = Console()
     args.out.mkdir(parents=True, exist_ok=True)
     figures: dict[str, object] = {}
@@ -204,6 +202,7 @@ def main(args: Args) -> None:
     console.print(table)
     decisive = [name for name, (_, rates) in curves.items() if rates.max() >= 0.9 and rates.min() <= 0.5]
     console.print(f"{len(decisive)} parameters take success from 90 % or more to 50 % or less: {', '.join(decisive)}")
+    save_figure(curves_figure({n: curves[n] for n in decisive}, env.parameters), args.out / "success_curves.png")
     (args.out / "figures.json").write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
 
 

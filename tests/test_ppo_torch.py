@@ -71,7 +71,8 @@ SMALL = PPOConfig(
     minibatches=4,
     target_kl=0.01,
     initial_log_std=-0.7,
-    warm_start_log_std=-0.7,
+    success_stop=None,
+    evaluation_share=0.0,
 )
 
 
@@ -158,18 +159,50 @@ def test_actions_stay_in_the_space():
 
 def test_stops_at_the_success_rate_asked_for():
     seen = []
-    config = replace(SMALL, iterations=60, success_stop=0.9, evaluation_envs=4, evaluation_episodes=16)
+    config = replace(SMALL, iterations=60, success_stop=0.9, evaluation_share=0.25, evaluation_episodes=16)
     policy = train(config, on_progress=seen.append)
     assert 2 <= len(seen) < 60
     assert seen[-1].success >= 0.9
     assert all(progress.success < 0.9 for progress in seen[1:-1])
-    assert policy.observation_normaliser.count == len(seen) * 12 * 20  # evaluation worlds are not learned from
-    with pytest.raises(ValueError, match="Pendulum"):
-        TorchPPO(config)(
-            lambda n: gym.make_vec("Pendulum-v1", n, vectorization_mode="sync", max_episode_steps=10),
-            None,
-            np.random.default_rng(0),
-        )
+    assert policy.steps_trained == len(seen) * 16 * 20
+    # Evaluation worlds are not learned from, nor is the last iteration: the policy returned is the one measured.
+    assert policy.observation_normaliser.count == (len(seen) - 1) * 12 * 20
+
+
+def test_an_env_without_success_is_trained_to_the_end():
+    seen = []
+    config = replace(SMALL, iterations=3, warm_start_iterations=3, success_stop=0.0, stuck_iterations=1)
+    trainer = TorchPPO(config, on_progress=seen.append)
+
+    def make(num_envs):
+        return gym.make_vec("Pendulum-v1", num_envs, vectorization_mode="sync", max_episode_steps=10)
+
+    further = trainer(make, trainer(make, None, np.random.default_rng(0)), np.random.default_rng(0))
+    assert len(seen) == 6
+    assert all(np.isnan(progress.success) and np.isfinite(progress.episode_return) for progress in seen)
+    assert further.log_std.max() < -0.6  # not known to be stuck
+
+
+class Unsolvable(Aim):
+    """Aim where nothing counts as success."""
+
+    def step(self, action):
+        return *super().step(action)[:4], {"is_success": False}
+
+
+@pytest.mark.parametrize(("env_class", "raised"), [(Unsolvable, True), (Aim, False)])
+def test_exploration_is_raised_only_where_a_given_policy_never_succeeds(env_class, raised):
+    policy = train()
+    assert policy.log_std.max() < -1.0
+    config = replace(SMALL, warm_start_iterations=3, stuck_iterations=3, stuck_log_std=-0.2)
+    assert (train(config, policy=policy, env_class=env_class).log_std.min() >= -0.2) == raised
+    before = train(replace(config, warm_start_iterations=2), policy=policy, env_class=env_class)
+    assert before.log_std.max() < -1.0
+
+
+def test_a_training_from_scratch_keeps_the_exploration_it_learns():
+    config = replace(SMALL, iterations=2, stuck_iterations=2, stuck_log_std=1.0)
+    assert train(config, env_class=Unsolvable).log_std.max() < 0.0
 
 
 def test_interrupt_leaves_the_checkpoint_of_the_last_iteration(tmp_path):
@@ -267,8 +300,8 @@ def test_refuses_what_it_cannot_train():
         )
     with pytest.raises(ValueError, match="epochs must be at least 1, got 0"):
         PPOConfig(epochs=0)
-    with pytest.raises(ValueError, match="evaluation_envs=8"):
-        PPOConfig(num_envs=8, success_stop=0.9)
+    with pytest.raises(ValueError, match="evaluation_share must be within"):
+        PPOConfig(evaluation_share=1.0)
 
 
 def test_command_line_trains_evaluates_and_saves(tmp_path, capsys):

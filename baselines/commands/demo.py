@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -13,7 +14,17 @@ from simopt_envs.adaptation import EnvSimulator, HiddenSystem, SimOpt
 from simopt_envs.adaptation.records import Iteration
 from simopt_envs.report import Details
 
-_TASKS = {"drawer": ("SimOpt/Drawer-v0", {"cabinet_x": 0.22})}
+TASKS: Mapping[str, tuple[str, Mapping[str, float]]] = {
+    "drawer": ("SimOpt/Drawer-v0", {"cabinet_x": 0.22}),
+    # A rope that is longer than thought, an arm that is softer and in one joint slower, a peg that grips.
+    "swing-peg": (
+        "SimOpt/SwingPeg-v0",
+        {"rope_segment_length": 0.05, "action_scaling_2": 1.8, "peg_friction": 0.75}
+        | {f"joint_gain_{joint}": 0.85 for joint in range(1, 5)},
+    ),
+}
+"""By name: the environment, and what the hidden system differs in."""
+
 _ITERATIONS = 3
 _ENOUGH = 0.95
 
@@ -30,17 +41,18 @@ class Demo:
     Run again, it goes on where it was, or shows what is there.
     """
 
-    task: Literal["drawer"] = "drawer"
+    task: Literal["drawer", "swing-peg"] = "drawer"
     """The task."""
-    out: Path = Path("out/demo")
-    """Folder for result.json, checkpoints, plots, film and report.html."""
+    out: Path | None = None
+    """Folder for result.json, checkpoints, plots, film and report.html; out/demo-TASK by default."""
     seed: int = 0
     """Seed of everything random."""
 
     def run(self, typed: str) -> None:
         """Train, adapt and report; ``typed`` is the command line."""
-        inputs.require_free(self.out, resume=True)
-        env_id, hidden = _TASKS[self.task]
+        out = self.out or Path(f"out/demo-{self.task}")
+        inputs.require_free(out, resume=True)
+        env_id, hidden = TASKS[self.task]
         simulator, display = EnvSimulator(env_id), Display()
         distribution = inputs.distribution(env_id, simulator.parameters, ())
         loop = SimOpt(
@@ -50,12 +62,14 @@ class Demo:
             HiddenSystem(env_id, hidden, noise=0.002),
             updates_per_iteration=inputs.UPDATES,
             seed=self.seed,
-            directory=self.out,
+            directory=out,
             on_event=display.event,
         )
-        named = ", ".join(f"{name} {value:+g} {simulator.parameters[name].unit}" for name, value in hidden.items())
+        nominal = simulator.parameters.as_dict(simulator.parameters.nominal)
         display.say(f"{env_id}: p(ξ) over {len(distribution.space)} parameters, all around their nominal values.")
-        display.say(f"The target, which stands for a robot, differs by what the loop cannot read: {named}.")
+        display.say("The target, which stands for a robot, differs by what the loop cannot read:")
+        for name, value in hidden.items():
+            display.say(f"  {name} {value:g} {simulator.parameters[name].unit}, nominally {nominal[name]:g}")
         last = run_loop(
             loop,
             _ITERATIONS,
@@ -68,4 +82,4 @@ class Demo:
         )
         estimate = dict(zip(last.distribution.space.names, last.distribution.median, strict=True))
         for name, value in hidden.items():
-            display.say(f"{name}: hidden {value:+.3f}, adapted {estimate[name]:+.3f} {simulator.parameters[name].unit}")
+            display.say(f"{name}: hidden {value:.3f}, adapted {estimate[name]:.3f} {simulator.parameters[name].unit}")
