@@ -193,6 +193,11 @@ class TorchPolicy(nn.Module):
         optimizer_state: State of Adam, to continue with; empty before the first training.
     """
 
+    low: Tensor
+    high: Tensor
+    centre: Tensor
+    half_range: Tensor
+
     def __init__(
         self,
         observation_size: int,
@@ -212,31 +217,36 @@ class TorchPolicy(nn.Module):
         self.log_std = nn.Parameter(torch.full((len(action_low),), initial_log_std))
         self.observation_normaliser = RunningNormaliser(observation_size, clip=10.0)
         self.value_normaliser = RunningNormaliser(1, clip=float("inf"))
-        self.low, self.high = torch.tensor(action_low), torch.tensor(action_high)
-        bounded = self.low.isfinite() & self.high.isfinite()
-        self.centre = torch.where(bounded, (self.low + self.high) / 2, 0.0)
-        self.half_range = torch.where(bounded, (self.high - self.low) / 2, 1.0)
+        low, high = torch.tensor(action_low), torch.tensor(action_high)
+        bounded = low.isfinite() & high.isfinite()
+        for name, values in (
+            ("low", low),
+            ("high", high),
+            ("centre", torch.where(bounded, (low + high) / 2, 0.0)),
+            ("half_range", torch.where(bounded, (high - low) / 2, 1.0)),
+        ):
+            self.register_buffer(name, values, persistent=False)
 
     @torch.inference_mode()
     def act(self, observations: NDArray[np.floating]) -> NDArray[np.float32]:
         """The mean action of each observation: (n, observation_size) -> (n, action_size), within the bounds."""
         with one_torch_thread():  # more of them only wait for the simulation's
-            return self.to_env(self.actor(self.observation_normaliser(_tensor(observations))))
+            return self.to_env(self.actor(self.observation_normaliser(_tensor(observations)))).numpy()
 
-    def to_env(self, actions: Tensor) -> NDArray[np.float32]:
+    def to_env(self, actions: Tensor) -> Tensor:
         """Normalised actions in the units of the action space, clipped into it."""
-        return (self.centre + self.half_range * actions).clamp(self.low, self.high).numpy()
+        return (self.centre + self.half_range * actions).clamp(self.low, self.high)
 
     @torch.inference_mode()
-    def values(self, observations: Array) -> Array:
+    def values(self, observations: Tensor) -> Tensor:
         """Discounted return expected from each observation: (..., observation_size) -> (...)."""
-        normalised = self.observation_normaliser(_tensor(observations))
-        return self.value_normaliser.denormalise(self.critic(normalised)).squeeze(-1).numpy()
+        return self.value_normaliser.denormalise(self.critic(self.observation_normaliser(observations))).squeeze(-1)
 
 
-def _tensor(observations: NDArray[np.floating]) -> Tensor:
-    """A copy in double precision, whatever the memory layout."""
-    return torch.from_numpy(np.array(observations, dtype=np.float64, order="C"))
+def _tensor(values: NDArray[np.floating] | Tensor) -> Tensor:
+    """A copy in double precision where the values are, whatever their memory layout."""
+    values = values if isinstance(values, Tensor) else torch.from_numpy(np.array(values, dtype=np.float64, order="C"))
+    return values.to(torch.float64, copy=True)
 
 
 def _network(inputs: int, hidden: int, outputs: int, output_gain: float, generator: torch.Generator) -> nn.Sequential:
@@ -259,18 +269,18 @@ def _network(inputs: int, hidden: int, outputs: int, output_gain: float, generat
 
 @dataclass(frozen=True)
 class Rollout:
-    """Transitions of T steps in n worlds, each array (T, n) or (T, n, size)."""
+    """Transitions of T steps in n worlds, each tensor (T, n) or (T, n, size), where the env's observations are."""
 
-    observations: Array
-    actions: NDArray[np.float32]
+    observations: Tensor
+    actions: Tensor
     """Normalised actions before clipping."""
-    rewards: Array
-    successors: Array
+    rewards: Tensor
+    successors: Tensor
     """What each step led to: at the end of an episode its own last observation."""
-    terminated: NDArray[np.bool_]
-    done: NDArray[np.bool_]
+    terminated: Tensor
+    done: Tensor
     """Terminated or truncated."""
-    valid: NDArray[np.bool_]
+    valid: Tensor
     """False where a step is not to be learned from: evaluation, or a mere reset (`AutoresetMode.NEXT_STEP`)."""
 
 
@@ -301,49 +311,58 @@ class Collector:
             )
         self.env = env
         self.same_step = mode == AutoresetMode.SAME_STEP
-        self.exploring = np.arange(env.num_envs) < env.num_envs - evaluation_envs
+        observation, _ = env.reset(seed=seed)
+        self._observation = _tensor(observation)
+        self.takes_tensors = isinstance(observation, Tensor)
+        self.device = self._observation.device
+        self.exploring = torch.arange(env.num_envs, device=self.device) < env.num_envs - evaluation_envs
         self.measured = ~self.exploring if evaluation_envs else self.exploring
         self.episodes: deque[tuple[float, float]] = deque(maxlen=window)
         self.best_success = float("nan")
-        self._observation = np.array(env.reset(seed=seed)[0], dtype=np.float64)
-        self._return = np.zeros(env.num_envs)
-        self._resets_next = np.zeros(env.num_envs, dtype=bool)
+        self._return = torch.zeros(env.num_envs, dtype=torch.float64, device=self.device)
+        self._resets_next = torch.zeros_like(self.exploring)
 
     @torch.inference_mode()
     def collect(self, policy: TorchPolicy, noise: Tensor) -> Rollout:
         """Act for T steps with exploration noise (T, n, action_size), standard normal numbers."""
         steps, worlds = noise.shape[:2]
-        observations = np.empty((steps, worlds, policy.observation_size))
-        successors = np.empty_like(observations)
+        observations = self._observation.new_empty((steps, worlds, policy.observation_size))
+        successors, rewards = torch.empty_like(observations), observations.new_empty((steps, worlds))
         actions = torch.empty_like(noise)
-        rewards = np.empty((steps, worlds))
-        terminated, done, valid = (np.empty((steps, worlds), dtype=bool) for _ in range(3))
-        deviations = policy.log_std.exp() * noise * torch.from_numpy(self.exploring).unsqueeze(-1)
+        terminated, done, valid = (torch.empty_like(rewards, dtype=torch.bool) for _ in range(3))
+        deviations = policy.log_std.exp() * noise * self.exploring.unsqueeze(-1)
         for t in range(steps):
             observations[t] = self._observation
-            normalised = policy.observation_normaliser(torch.from_numpy(self._observation))
+            normalised = policy.observation_normaliser(self._observation)
             torch.add(policy.actor(normalised), deviations[t], out=actions[t])
-            observation, rewards[t], terminated[t], truncated, infos = self.env.step(policy.to_env(actions[t]))
-            done[t] = terminated[t] | truncated
+            action = policy.to_env(actions[t])
+            stepped = self.env.step(action if self.takes_tensors else action.numpy())
+            observation, reward, over, truncated, infos = stepped
+            rewards[t], terminated[t] = torch.as_tensor(reward), torch.as_tensor(over)
+            done[t] = terminated[t] | torch.as_tensor(truncated)
             valid[t] = self.exploring & ~self._resets_next
-            successors[t] = self._observation = np.array(observation, dtype=np.float64)
-            if self.same_step:
-                if done[t].any():
-                    successors[t, done[t]] = np.stack(infos["final_obs"][done[t]])
-            else:
+            successors[t] = self._observation = _tensor(observation)
+            ended = bool(done[t].any())
+            if self.same_step and ended:
+                final = infos["final_obs"]
+                final = final[done[t]] if self.takes_tensors else np.stack(final[done[t].numpy()])
+                successors[t, done[t]] = _tensor(final)
+            elif not self.same_step:
                 self._resets_next = done[t]
-            self._keep_score(rewards[t], done[t], infos)
-        return Rollout(observations, actions.numpy(), rewards, successors, terminated, done, valid)
+            self._return += rewards[t]
+            if ended:
+                self._keep_score(done[t], infos)
+        return Rollout(observations, actions, rewards, successors, terminated, done, valid)
 
-    def _keep_score(self, rewards: Array, done: NDArray[np.bool_], infos: dict[str, Any]) -> None:
-        self._return += rewards
-        if done.any():
-            # Gymnasium's own vector envs move the info of an episode's last step into final_info.
-            success = infos.get("final_info", infos).get("is_success", np.full(len(done), np.nan))
-            for world in np.flatnonzero(done & self.measured):
-                self.episodes.append((float(self._return[world]), float(success[world])))
-            self.best_success = float(np.fmax(self.best_success, np.max(success[done])))
-            self._return[done] = 0.0
+    def _keep_score(self, done: Tensor, infos: dict[str, Any]) -> None:
+        # Gymnasium's own vector envs move the info of an episode's last step into final_info.
+        reported = infos.get("final_info", infos).get("is_success", np.full(len(done), np.nan))
+        success = reported.cpu().numpy() if isinstance(reported, Tensor) else reported
+        returns, finished, measured = (x.cpu().numpy() for x in (self._return, done, self.measured))
+        for world in np.flatnonzero(finished & measured):
+            self.episodes.append((float(returns[world]), float(success[world])))
+        self.best_success = float(np.fmax(self.best_success, np.max(success[finished])))
+        self._return[done] = 0.0
 
     def score(self) -> tuple[float, float]:
         """Mean return and success of the remembered episodes; NaN before the first."""
@@ -352,8 +371,8 @@ class Collector:
 
 
 def generalised_advantages(
-    rollout: Rollout, values: Array, successor_values: Array, gamma: float, gae_lambda: float
-) -> Array:
+    rollout: Rollout, values: Tensor, successor_values: Tensor, gamma: float, gae_lambda: float
+) -> Tensor:
     """Generalised advantage estimation (Schulman et al. 2016, Eq. 16), cut at the end of each episode.
 
     Args:
@@ -366,10 +385,10 @@ def generalised_advantages(
     Returns:
         Advantages (T, n); meaningless where `rollout.valid` is False.
     """
-    errors = rollout.rewards + gamma * np.where(rollout.terminated, 0.0, successor_values) - values
-    decays = gamma * gae_lambda * ~rollout.done
-    advantages = np.empty_like(errors)
-    advantage = np.zeros(errors.shape[1])
+    errors = rollout.rewards + gamma * successor_values.where(~rollout.terminated, 0.0) - values
+    decays = gamma * gae_lambda * (~rollout.done).double()
+    advantages = torch.empty_like(errors)
+    advantage = torch.zeros_like(errors[0])
     for t in reversed(range(len(errors))):
         advantage = advantages[t] = errors[t] + decays[t] * advantage
     return advantages
@@ -390,7 +409,7 @@ class Batch:
         """Disjoint minibatches that together hold every row once."""
         columns = [getattr(self, column.name) for column in fields(self)]
         rows = len(self.actions)
-        order = torch.randperm(rows, generator=generator)
+        order = torch.randperm(rows, generator=generator).to(self.actions.device)
         for minibatch in zip(*(column[order].split(-(-rows // parts)) for column in columns), strict=True):
             yield Batch(*minibatch)
 
@@ -404,18 +423,18 @@ def log_prob(actions: Tensor, means: Tensor, log_std: Tensor) -> Tensor:
 def prepare(policy: TorchPolicy, rollout: Rollout, config: PPOConfig) -> Batch:
     """Take the rollout into the policy's normalisers and evaluate it: advantages, value targets, log-probabilities."""
     valid = rollout.valid
-    if not (np.isfinite(rollout.observations).all() and np.isfinite(rollout.rewards).all()):
+    if not (rollout.observations.isfinite().all() and rollout.rewards.isfinite().all()):
         raise ValueError("the env gave an observation or a reward that is not finite")
-    raw = torch.from_numpy(rollout.observations[valid])
+    raw = rollout.observations[valid]
     policy.observation_normaliser.update(raw)
 
     old_values, successor_values = policy.values(rollout.observations), policy.values(rollout.successors)
     advantages = generalised_advantages(rollout, old_values, successor_values, config.gamma, config.gae_lambda)
-    returns = torch.from_numpy((advantages + old_values)[valid]).unsqueeze(-1)
+    returns = (advantages + old_values)[valid].unsqueeze(-1)
     policy.value_normaliser.update(returns)
-    kept = torch.from_numpy(advantages[valid])
+    kept = advantages[valid]
     observations = policy.observation_normaliser(raw)
-    actions, means = torch.from_numpy(rollout.actions[valid]), policy.actor(observations)
+    actions, means = rollout.actions[valid], policy.actor(observations)
     return Batch(
         observations,
         actions,
@@ -505,16 +524,17 @@ class TorchPPO:
         steps_per_iteration = config.num_envs * config.num_steps
         generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
         policy = _starting_policy(env, policy, config, generator)
+        seed, evaluation_envs = int(rng.integers(2**31)), int(config.evaluation_share * config.num_envs)
+        collector = Collector(env, seed, evaluation_envs, config.evaluation_episodes)
+        policy.to(collector.device)
         optimizer = torch.optim.Adam(policy.parameters(), lr=config.learning_rate, fused=True)
         if policy.optimizer_state:
             optimizer.load_state_dict(policy.optimizer_state)
-        evaluation_envs = int(config.evaluation_share * config.num_envs)
-        collector = Collector(env, int(rng.integers(2**31)), evaluation_envs, config.evaluation_episodes)
 
         kl = float("nan")
         for iteration in range(1, iterations + 1):
             noise = torch.randn((config.num_steps, config.num_envs, len(policy.log_std)), generator=generator)
-            rollout = collector.collect(policy, noise)
+            rollout = collector.collect(policy, noise.to(collector.device))
             policy.steps_trained += steps_per_iteration
             episode_return, success = collector.score()
             measured_enough = len(collector.episodes) == config.evaluation_episodes
@@ -542,7 +562,7 @@ class TorchPPO:
                 )
             if solved:
                 break
-        return policy
+        return policy.cpu()
 
     def save(self, policy: TorchPolicy, path: Path) -> None:
         """Write a policy with its optimiser; a file already there is replaced at once or not at all."""
@@ -565,7 +585,7 @@ class TorchPPO:
         Raises:
             FileNotFoundError: No such file.
         """
-        content = torch.load(path, weights_only=True)
+        content = torch.load(path, weights_only=True, map_location="cpu")
         policy = TorchPolicy(**content["architecture"], initial_log_std=0.0, generator=torch.Generator())
         policy.load_state_dict(content["state"])
         policy.optimizer_state = content["optimizer_state"]

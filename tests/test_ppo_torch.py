@@ -229,14 +229,17 @@ def random_rollout(rng, steps=40, num_envs=6):
     terminated = rng.random((steps, num_envs)) < 0.1
     done = terminated | (rng.random((steps, num_envs)) < 0.1)
     numbers = rng.normal(size=(steps, num_envs, 1))
-    return Rollout(numbers, numbers, numbers[..., 0], numbers, terminated, done, np.ones_like(done))
+    arrays = (numbers, numbers, numbers[..., 0], numbers, terminated, done, np.ones_like(done))
+    return Rollout(*map(torch.as_tensor, arrays))
 
 
 def test_advantages_match_the_sum_over_steps():
     rng, gamma, gae_lambda = np.random.default_rng(3), 0.9, 0.8
     rollout = random_rollout(rng)
     values, successor_values = rng.normal(size=(2, *rollout.rewards.shape))
-    advantages = generalised_advantages(rollout, values, successor_values, gamma, gae_lambda)
+    advantages = generalised_advantages(
+        rollout, torch.as_tensor(values), torch.as_tensor(successor_values), gamma, gae_lambda
+    )
     assert (rollout.done & ~rollout.terminated).any()
     for world in range(rollout.rewards.shape[1]):
         for start in range(len(rollout.rewards)):
@@ -247,7 +250,7 @@ def test_advantages_match_the_sum_over_steps():
                 expected += (gamma * gae_lambda) ** (t - start) * error
                 if rollout.done[t, world]:
                     break
-            assert advantages[start, world] == pytest.approx(expected, abs=1e-12)
+            assert float(advantages[start, world]) == pytest.approx(float(expected), abs=1e-12)
 
 
 def test_both_autoreset_modes_give_the_same_transitions():

@@ -18,6 +18,7 @@ from simopt_envs.adaptation import CEM, REPS, EnvSimulator, HiddenSystem, Record
 from simopt_envs.adaptation.checkpoint import write_json
 from simopt_envs.adaptation.fitting import CMAES, LeastSquares, WindowMisfit, untold_combinations
 from simopt_envs.adaptation.updates import Update
+from simopt_envs.engine import Engine, LocalEngine, RayEngine
 from simopt_envs.physics import ModelWriter
 from simopt_envs.report import Details, write_report
 
@@ -72,6 +73,11 @@ class Adapt:
     """How p(ξ) is updated. Model: also by a fit to all windows, with a Laplace covariance."""
     epsilon: float = 1.0
     """Bound of the KL divergence of an update, in nats."""
+    engine: Literal["local", "ray"] = "local"
+    """What simulates the rollouts of an update: this machine's cores, or tasks of Ray. The results are the same."""
+    ray_address: str | None = None
+    """With --engine ray: address of the cluster (HOST:PORT, or auto); by default the one that this machine is part of,
+    else this machine alone."""
     seed: int = 0
     """Seed of everything random."""
     resume: bool = False
@@ -80,6 +86,8 @@ class Adapt:
     def run(self, typed: str) -> None:
         """Adapt and report; ``typed`` is the command line."""
         inputs.require_free(self.out, self.resume)
+        if self.ray_address is not None and self.engine != "ray":
+            raise ValueError(f"--ray-address {self.ray_address} needs --engine ray")
         if Path(self.system).suffix in MODEL_SUFFIXES:
             self._adapt_model(typed)
         else:
@@ -93,8 +101,8 @@ class Adapt:
         if self.target is None:
             raise ValueError(f"{self.system} needs --target target.json, the hidden system to adapt to")
         target = inputs.Target.read(self.target)
-        simulator = EnvSimulator(self.system)
         display = Display()
+        simulator = EnvSimulator(self.system, engine=self._engine(display))
         real_rollouts = 3 if self.real_rollouts is None else self.real_rollouts
         loop = SimOpt(
             simulator,
@@ -142,7 +150,7 @@ class Adapt:
         real_rollouts = len(trajectories) if self.real_rollouts is None else self.real_rollouts
         display = Display()
         loop = SimOpt(
-            ReplaySimulator(model, prior.space, windows),
+            ReplaySimulator(model, prior.space, windows, self._engine(display)),
             prior,
             None,
             RecordedSystem(trajectories),
@@ -172,6 +180,11 @@ class Adapt:
         write_report(self.out)
         for finding in findings:
             display.say(finding)
+
+    def _engine(self, display: Display) -> Engine:
+        if self.engine == "ray":
+            return RayEngine(self.ray_address, display.tasks)
+        return LocalEngine(display.tasks)
 
     def _update(self) -> Update:
         return REPS(epsilon=self.epsilon) if self.update == "reps" else CEM(epsilon=self.epsilon)

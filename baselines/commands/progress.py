@@ -90,17 +90,12 @@ class Display:
         left = (progress.total_steps - progress.steps) / per_second
         rate = f"{per_second / 1000:.1f}k steps/s, {left:.0f} s left"
         success = "" if np.isnan(progress.success) else f", success {progress.success:.0%}"
-        if self.console.is_terminal:
-            self._bar.update(
-                self._task,
-                total=progress.total_steps,
-                completed=progress.steps,
-                description=self._what + success,
-                rate=rate,
-            )
-        elif time.monotonic() - self._last_line > _SECONDS_BETWEEN_LINES:
-            self._line(f"{self._what}: {progress.steps / progress.total_steps:.0%}{success}, {rate}")
-            self._last_line = time.monotonic()
+        self._advance(progress.steps, progress.total_steps, success, rate)
+
+    def tasks(self, done: int, total: int) -> None:
+        """Take note of how many tasks of a phase an engine has done."""
+        if total > 1:
+            self._advance(done, total, "", f"{done} of {total} tasks")
 
     def iteration(self, iteration: Iteration) -> None:
         """Print the row of an iteration."""
@@ -128,6 +123,13 @@ class Display:
     def say(self, text: str) -> None:
         """Print a line."""
         self._line(text)
+
+    def _advance(self, done: int, total: int, result: str, rate: str) -> None:
+        if self.console.is_terminal:
+            self._bar.update(self._task, total=total, completed=done, description=self._what + result, rate=rate)
+        elif time.monotonic() - self._last_line > _SECONDS_BETWEEN_LINES:
+            self._line(f"{self._what}: {done / total:.0%}{result}, {rate}")
+            self._last_line = time.monotonic()
 
     def _line(self, text: str) -> None:
         self.console.print(text, markup=False, highlight=False, soft_wrap=True)

@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal, Protocol
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrapper
+from numpy.typing import NDArray
 
 from simopt_envs.adaptation.protocols import Policy
 from simopt_envs.adaptation.rollouts import Rollouts, run_episodes
 from simopt_envs.distributions.distribution import Sampler
 from simopt_envs.distributions.draws import EpisodeDraws
+from simopt_envs.engine import Engine, FailedTasksError, LocalEngine
 from simopt_envs.measured.trajectory import Trajectory
 from simopt_envs.physics.parameters import Array, ParameterSpace
 
+_MANY = 1024
+"""From so many worlds on, to draw ξ for each from a generator of its own takes longer than to simulate them."""
 VectorizationMode = Literal["native", "sync", "async"]
 
 
@@ -67,6 +74,10 @@ class EnvSimulator:
             takes all worlds' parameters as an array (n, d) and which has a ``parameter_source``; ``"sync"``,
             ``"async"``: Gymnasium's, over single environments. None: native where it can be had, else sync.
         num_envs: most worlds that :meth:`rollout` runs at a time.
+        engine: does the rollouts, so many worlds a task. Where its tasks run on one thread each, the id's own vector
+            environment is made with ``num_threads=1``.
+        **options: for the id's own vector environment: ``backend="warp"``, say. With many worlds, their ξ are drawn
+            at once.
 
     Raises:
         ValueError: for an environment without ``parameters``, or without a vector environment of its own where that
@@ -78,15 +89,29 @@ class EnvSimulator:
         env: str | Callable[[], gym.Env],
         vectorization_mode: VectorizationMode | None = None,
         num_envs: int = 256,
+        engine: Engine | None = None,
+        **options: Any,
     ):
         self.env_id = env if isinstance(env, str) else getattr(env, "__name__", type(env).__name__)
         self.num_envs = num_envs
-        self._make_env: Callable[[], gym.Env] = partial(gym.make, env) if isinstance(env, str) else env
-        has_own = isinstance(env, str) and gym.spec(env).vector_entry_point is not None
+        self.engine: Engine = engine or LocalEngine()
+        self._num_threads = self.engine.num_threads
+        # The spec, not the id: where a task runs, the id need not be registered.
+        self._spec: EnvSpec | None = None
+        self._make_env: Callable[[], gym.Env]
+        if isinstance(env, str):
+            self._spec = gym.spec(env)
+            self._make_env = partial(gym.make, self._spec)
+        else:
+            self._make_env = env
+        has_own = self._spec is not None and self._spec.vector_entry_point is not None
         if vectorization_mode == "native" and not has_own:
             raise ValueError(f'{self.env_id} has no vector environment of its own; use "sync" or "async"')
         self.vectorization_mode: VectorizationMode = vectorization_mode or ("native" if has_own else "sync")
-        self._fall_back = vectorization_mode is None
+        if options and self.vectorization_mode != "native":
+            raise ValueError(f"{self.env_id} runs {self.vectorization_mode}: it takes no {', '.join(options)}")
+        self._options = options
+        self._fall_back = vectorization_mode is None and not options
         self._worlds: VectorEnv | None = None
 
         single = self._make_env()
@@ -107,7 +132,7 @@ class EnvSimulator:
 
     def identity(self) -> dict[str, Any]:
         """What identifies it in a checkpoint."""
-        return {"env_id": self.env_id}
+        return {"env_id": self.env_id, **self._options}
 
     def make_vector_env(self, num_envs: int, distribution: Sampler, seed: int) -> VectorEnv:
         """See :meth:`Simulator.make_vector_env`. Worlds that are done are reset in the same step."""
@@ -115,7 +140,7 @@ class EnvSimulator:
 
     def make_worlds(self, num_envs: int) -> VectorEnv:
         """A vector environment at nominal ξ but for ``reset(options={"parameters": (n, d)})``."""
-        return self._open(num_envs, AutoresetMode.NEXT_STEP)
+        return _OnHost(self._open(num_envs, AutoresetMode.NEXT_STEP))
 
     def rollout(
         self, policy: Policy | None, space: ParameterSpace, xi: Array, real: Sequence[Trajectory], seed: int
@@ -124,25 +149,50 @@ class EnvSimulator:
         if policy is None:
             raise ValueError("closed-loop rollouts need a policy")
         n, r = len(xi), len(real)
-        parameters = self.parameters.values(dict(zip(space.names, np.transpose(xi), strict=True)), n).repeat(r, axis=0)
-        starts = np.tile([trajectory.observations[0] for trajectory in real], (n, 1))
-        seeds = np.tile(np.random.SeedSequence(seed).generate_state(r) // 2, n)
-        parts = -(-n * r // self.num_envs)
+        episodes = _Episodes(
+            self.parameters.values(dict(zip(space.names, np.transpose(xi), strict=True)), n).repeat(r, axis=0),
+            np.tile([trajectory.observations[0] for trajectory in real], (n, 1)),
+            np.tile(np.random.SeedSequence(seed).generate_state(r) // 2, n),
+            max(map(len, real)),
+        )
+        parts = -(-n * r // self.num_envs)  # whatever the engine, as the results are to be
         size = -(-n * r // parts)
-        if self._worlds is None or self._worlds.num_envs != size:
-            self.close()
-            self._worlds = self.make_worlds(size)
-        rollouts = [
-            run_episodes(
-                self._worlds,
-                policy,
-                max(map(len, real)),
-                seed=seeds[chosen].tolist(),
-                options={"parameters": parameters[chosen], "initial_observation": starts[chosen]},
-            )
-            for chosen in np.arange(parts * size).reshape(parts, size) % (n * r)  # the last part repeats the first
-        ]
+        rows = np.arange(parts * size).reshape(parts, size) % (n * r)  # the last part repeats the first
+        rollouts = self._roll_out(policy, [episodes.select(chosen) for chosen in rows])
         return Rollouts.concatenate(rollouts).map(lambda x: x[: n * r].reshape(n, r, *x.shape[1:]))
+
+    def _roll_out(self, policy: Policy, parts: list[_Episodes]) -> list[Rollouts]:
+        """Rollouts of each part. Episodes that cannot be run, say as they crash their worker, count as diverged."""
+        try:
+            return self.engine.map(_roll_out, parts, (self, policy))
+        except FailedTasksError as error:
+            finished = next((part for part in error.results if part is not None), None)
+            if finished is None:
+                raise error.failures[0] from error
+            for i in error.failures:
+                error.results[i] = self._one_by_one(policy, parts[i], finished.map(lambda x: x[:1]))
+            return error.results
+
+    def _one_by_one(self, policy: Policy, episodes: _Episodes, like: Rollouts) -> Rollouts:
+        """Rollouts of episodes among which some cannot be run."""
+        each = [episodes.select(np.array([i])) for i in range(len(episodes.seeds))]
+        try:
+            rollouts = self.engine.map(_roll_out, each, (self, policy))
+        except FailedTasksError as error:
+            rollouts = error.results
+            for i, cause in error.failures.items():
+                rollouts[i] = _diverged(like)
+                warnings.warn(
+                    f"an episode cannot be simulated and counts as diverged: seed {episodes.seeds[i]}, "
+                    f"ξ {self.parameters.as_dict(episodes.xi[i])}: {type(cause).__name__}: {cause}",
+                    RuntimeWarning,
+                    stacklevel=4,
+                )
+        return Rollouts.concatenate(rollouts)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what belongs to this process: open worlds, and the engine."""
+        return self.__dict__ | {"_worlds": None, "engine": None}
 
     def close(self) -> None:
         """Close the worlds that were kept for the next rollout."""
@@ -150,25 +200,87 @@ class EnvSimulator:
             self._worlds.close()
             self._worlds = None
 
+    def run(self, policy: Policy, episodes: _Episodes) -> Rollouts:
+        """Run episodes side by side, in worlds that are kept for the next ones."""
+        size = len(episodes.seeds)
+        if self._worlds is None or self._worlds.num_envs != size:
+            self.close()
+            self._worlds = _OnHost(self._open(size, AutoresetMode.NEXT_STEP, num_threads=self._num_threads))
+        options = {"parameters": episodes.xi, "initial_observation": episodes.starts}
+        return run_episodes(self._worlds, policy, episodes.steps, seed=episodes.seeds.tolist(), options=options)
+
     def _open(
-        self, num_envs: int, mode: AutoresetMode, distribution: Sampler | None = None, seed: int = 0
+        self,
+        num_envs: int,
+        mode: AutoresetMode,
+        distribution: Sampler | None = None,
+        seed: int = 0,
+        num_threads: int = 0,
     ) -> VectorEnv:
         if self.vectorization_mode == "native":
+            assert self._spec is not None
+            options = self._options | ({"num_threads": num_threads} if num_threads else {})
             try:
-                env = gym.make_vec(self.env_id, num_envs, "vector_entry_point", autoreset_mode=mode)
+                env = gym.make_vec(self._spec, num_envs, "vector_entry_point", autoreset_mode=mode, **options)
             except ImportError:  # MuJoCo too old for it
                 if not self._fall_back:
                     raise
                 self.vectorization_mode = "sync"
-                return self._open(num_envs, mode, distribution, seed)
+                return self._open(num_envs, mode, distribution, seed, num_threads)
             if distribution is not None:
-                draws = EpisodeDraws(self.parameters, distribution, num_envs)
+                draws = EpisodeDraws(self.parameters, distribution, num_envs, at_once=num_envs >= _MANY)
                 draws.seed(seed)
                 env.unwrapped.parameter_source = draws  # type: ignore[attr-defined]
             return env
         worlds = [partial(_World, self._make_env, i, distribution, seed + i) for i in range(num_envs)]
         vector_env = SyncVectorEnv if self.vectorization_mode == "sync" else AsyncVectorEnv
         return vector_env(worlds, autoreset_mode=mode)
+
+
+@dataclass(frozen=True)
+class _Episodes:
+    """k episodes to run side by side, each with its ξ (k, d), first observation (k, o) and seed (k,)."""
+
+    xi: Array
+    starts: Array
+    seeds: NDArray[np.unsignedinteger]
+    steps: int
+
+    def select(self, rows: NDArray[np.intp]) -> _Episodes:
+        return _Episodes(self.xi[rows], self.starts[rows], self.seeds[rows], self.steps)
+
+
+def _roll_out(episodes: _Episodes, simulator: EnvSimulator, policy: Policy) -> Rollouts:
+    return simulator.run(policy, episodes)
+
+
+def _diverged(like: Rollouts) -> Rollouts:
+    """Rollouts of the same size that diverged at once."""
+    return Rollouts(
+        np.full_like(like.observations, np.nan),
+        np.full_like(like.actions, np.nan),
+        np.zeros_like(like.lengths),
+        np.ones_like(like.diverged),
+        None if like.success is None else np.zeros_like(like.success),
+    )
+
+
+class _OnHost(VectorWrapper):
+    """Brings what a vector environment on a GPU returns into the host's memory; the actions may be there."""
+
+    def reset(self, **arguments: Any) -> tuple[Any, dict[str, Any]]:
+        return _on_host(self.env.reset(**arguments))
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        return _on_host(self.env.step(actions))
+
+
+def _on_host(values: Any) -> Any:
+    if isinstance(values, dict):
+        return {name: _on_host(value) for name, value in values.items()}
+    if isinstance(values, tuple):
+        return tuple(map(_on_host, values))
+    return values.cpu().numpy() if hasattr(values, "cpu") else values
 
 
 class _World(gym.Wrapper):

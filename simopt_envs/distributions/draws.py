@@ -23,13 +23,16 @@ class EpisodeDraws:
         space: all parameters of the environment; those that the distribution does not name stay nominal.
         distribution: what to draw from. One that has no ``space`` draws all parameters of the environment, in order.
         num_worlds: n.
+        at_once: draw for all worlds that begin an episode together, from one generator: fast for thousands of them,
+            and each world's draws then depend on the others.
 
     Raises:
         ValueError: if the distribution names a parameter that the environment does not have.
         TypeError: if the distribution cannot ``sample``.
     """
 
-    def __init__(self, space: ParameterSpace, distribution: Sampler, num_worlds: int = 1):
+    def __init__(self, space: ParameterSpace, distribution: Sampler, num_worlds: int = 1, at_once: bool = False):
+        self.at_once = at_once
         self.space = space
         self.num_worlds = num_worlds
         self.distribution = distribution
@@ -70,13 +73,18 @@ class EpisodeDraws:
             ValueError: if the distribution draws a wrong shape or a value that is not valid.
         """
         xi = np.tile(self.space.nominal, (len(worlds), 1))
-        for row, world in enumerate(worlds):
-            draw = np.asarray(self._distribution.sample(1, self._rngs[world]), dtype=np.float64)
-            if draw.shape != (1, len(self._columns)):
-                raise ValueError(
-                    f"{type(self._distribution).__name__}.sample(1, rng) must have shape (1, {len(self._columns)}), "
-                    f"a column for each of {', '.join(self.space.names[c] for c in self._columns)}; got {draw.shape}"
-                )
-            xi[row, self._columns] = draw[0]
-            self.space.validate(xi[row])
-        return xi
+        if self.at_once:
+            xi[:, self._columns] = self._sample(len(worlds), self._rngs[0])
+        else:
+            for row, world in enumerate(worlds):
+                xi[row, self._columns] = self._sample(1, self._rngs[world])[0]
+        return self.space.validate(xi)
+
+    def _sample(self, n: int, rng: np.random.Generator) -> Array:
+        draw = np.asarray(self._distribution.sample(n, rng), dtype=np.float64)
+        if draw.shape != (n, len(self._columns)):
+            raise ValueError(
+                f"{type(self._distribution).__name__}.sample({n}, rng) must have shape ({n}, {len(self._columns)}), "
+                f"a column for each of {', '.join(self.space.names[c] for c in self._columns)}; got {draw.shape}"
+            )
+        return draw

@@ -115,6 +115,11 @@ class Hypothesis:
             self.space.names[i].removeprefix(candidate.full_name("")): float(xi[i]) for i in self.columns[candidate]
         }
 
+    def amounts(self, candidate: Candidate) -> list[int]:
+        """The columns of a candidate that say how much of the effect there is, not what shape it has."""
+        shape = {candidate.full_name(name) for name in candidate.effect.shape}
+        return [i for i in self.columns[candidate] if self.space.names[i] not in shape]
+
     def without(self, candidate: Candidate, u: Array) -> Array:
         """Coordinates (d,) with those of one candidate left out."""
         return np.delete(u, self.columns[candidate])

@@ -249,7 +249,7 @@ class Search:
         """What a candidate would gain if its best probe acted linearly."""
         hypothesis = Hypothesis(self.plain, [*base.hypothesis.candidates, candidate], self.motion)
         misfit = Misfit(hypothesis, self.data.fitted).with_noise(base.noise)
-        columns, neutral = hypothesis.columns[candidate], hypothesis.neutral()
+        amounts, neutral = hypothesis.amounts(candidate), hypothesis.neutral()
         probes = hypothesis.probes(candidate)
         probes[:, : len(base.fit.u)] = base.fit.u
         residual, (orthonormal, triangle) = base.fit.residual, base.fit.orthonormal
@@ -259,10 +259,11 @@ class Search:
             absorbed = orthonormal.T @ change
             direction = change - orthonormal @ absorbed
             size, slope = float(direction @ direction), float(direction @ residual)
-            step = _clipped(-slope / size if size > 0 else 0.0, probe - neutral, neutral, hypothesis, columns)
+            step = _clipped(-slope / size if size > 0 else 0.0, probe - neutral, neutral, hypothesis, amounts)
             gain = -step * slope - 0.5 * step**2 * size
-            shift = np.concatenate([-np.linalg.solve(triangle, absorbed), (probe - neutral)[columns]])
-            origin = np.concatenate([base.fit.u, neutral[columns]])
+            origin, shift = probe.copy(), np.zeros(len(probe))
+            shift[: len(base.fit.u)] = -np.linalg.solve(triangle, absorbed)
+            origin[amounts], shift[amounts] = neutral[amounts], (probe - neutral)[amounts]
             starts = np.clip(origin + step * _STEPS[:, None] * shift, hypothesis.low, hypothesis.high)
             found.append(Screened(candidate, hypothesis, direction, gain, starts))
         best = max(found, key=lambda s: s.gain)
@@ -282,7 +283,11 @@ class Search:
             start = hypothesis.neutral()
             effects = slice(base.hypothesis.num_plain, len(base.fit.u))
             start[effects] = base.fit.u[effects]
-            tried = start + _SIZES[:, None, None] * (hypothesis.probes(screened.candidate) - hypothesis.neutral())
+            probes = hypothesis.probes(screened.candidate)
+            probes[:, : len(base.fit.u)] = start[: len(base.fit.u)]
+            amounts = hypothesis.amounts(screened.candidate)
+            tried = np.tile(probes, (len(_SIZES), 1, 1))
+            tried[..., amounts] = start[amounts] + _SIZES[:, None, None] * (probes[:, amounts] - start[amounts])
             tried = np.clip(tried.reshape(-1, len(start)), hypothesis.low, hypothesis.high)
             other = fit(misfit, misfit.best(tried), _ITERATIONS)
             found = min(found, other, key=lambda f: f.loss)

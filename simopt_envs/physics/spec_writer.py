@@ -81,7 +81,7 @@ def _attribute(kind: str, attribute: str, columns: slice = slice(None)) -> _Writ
             setattr(element, attribute, float(row.values[0]))
         else:
             value = np.array(value, dtype=np.float64)
-            value[columns] = row.values
+            value[columns] = row.values[: len(value[columns])]  # a ball's three axes share an attribute
             setattr(element, attribute, value)
 
     return write
@@ -118,10 +118,14 @@ def _inertial(spec: mujoco.MjSpec, row: _Row) -> None:
     body.fullinertia = np.array([np.nan, 0, 0, 0, 0, 0])
 
 
-def _site_position(spec: mujoco.MjSpec, row: _Row) -> None:
-    """Moves a site by what it moves in its body's frame; the spec counts in the frame that the site is in."""
-    site = spec.site(row.object)
-    site.pos = site.pos + _rotation(spec, site.frame).T @ row.change
+def _place(kind: str) -> _Writer:
+    """Moves an element by what it moves in its body's frame; the spec counts in the frame that the element is in."""
+
+    def write(spec: mujoco.MjSpec, row: _Row) -> None:
+        element = getattr(spec, kind)(row.object)
+        element.pos = element.pos + _rotation(spec, element.frame).T @ row.change
+
+    return write
 
 
 def _rotation(spec: mujoco.MjSpec, frame: Any) -> Array:
@@ -167,8 +171,10 @@ _WRITERS: dict[str, _Writer] = {
     **_polynomial("tendon", "tendon_stiffness", "stiffness"),
     **_polynomial("tendon", "tendon_damping", "damping"),
     "tendon_lengthspring": _attribute("tendon", "springlength"),
-    **_same("geom", "friction", "solref", "solimp"),
+    **_same("geom", "size", "friction", "solref", "solimp"),
+    **_same("site", "size"),
     **_same("pair", "friction", "solref", "solimp"),
     "eq_data": _attribute("equality", "data"),
-    "site_pos": _site_position,
+    **{f"{kind}_pos": _place(kind) for kind in ("body", "geom", "site")},
+    "numeric_data": _attribute("numeric", "data"),
 }

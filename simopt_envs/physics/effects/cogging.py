@@ -18,7 +18,7 @@ from simopt_envs.physics.effects.joints import (
 )
 from simopt_envs.physics.parameters import Parameter, Write
 
-_HARMONICS = 6
+_PERIODS = 0.7 * np.arange(1, 9)  # in the range of the motion: near enough for a fit to find those between
 _PHASES = (0.0, np.pi / 2)
 
 
@@ -27,6 +27,7 @@ class Cogging(Effect):
 
     name = "cogging"
     law = "f = A sin(n q + phase)"
+    shape = ("periods", "phase")
 
     def places(self, model: mujoco.MjModel) -> tuple[str, ...]:
         """See :meth:`Effect.places`."""
@@ -52,12 +53,12 @@ class Cogging(Effect):
         )
 
     def probes(self, model: mujoco.MjModel, place: str, motion: Motion) -> tuple[dict[str, float], ...]:
-        """Sines and cosines with 1, 2, ... periods in the range of the motion: any other is near one of these."""
+        """Sines and cosines with several numbers of periods in the range of the motion."""
         joint = object_name(place)
         i = dof(model, joint)
         base = 2 * np.pi / float(motion.high[i] - motion.low[i])
         force = probe_force(model, joint, motion)
         return tuple(
-            {"amplitude": force, "periods": k * base, "phase": phase}
-            for k, phase in itertools.product(range(1, _HARMONICS + 1), _PHASES)
+            {"amplitude": force, "periods": float(k) * base, "phase": phase}
+            for k, phase in itertools.product(_PERIODS, _PHASES)
         )

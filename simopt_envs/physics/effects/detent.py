@@ -29,6 +29,7 @@ class Detent(Effect):
 
     name = "detent"
     law = "f = -F sign(x) max(0, 1 - |2 |x| / w - 1|), x = q - q_0"
+    shape = ("width", "position")
 
     def places(self, model: mujoco.MjModel) -> tuple[str, ...]:
         """See :meth:`Effect.places`."""

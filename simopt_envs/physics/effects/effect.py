@@ -42,10 +42,12 @@ class Effect(ABC):
     Attributes:
         name: as in reports and in ``gap.json``.
         law: one line, as a person would write it.
+        shape: those of its parameters that say what it is like, not how much of it there is.
     """
 
     name: ClassVar[str]
     law: ClassVar[str]
+    shape: ClassVar[tuple[str, ...]] = ()
 
     @abstractmethod
     def places(self, model: mujoco.MjModel) -> tuple[str, ...]:
@@ -72,8 +74,8 @@ class Effect(ABC):
 
         ``model`` is the one that ``motion`` is of, without the effect's structure.
 
-        A probe and a multiple of it are told apart by the fit; what a multiple cannot make (another width of a detent)
-        needs a probe of its own. Every parameter has a size in at least one probe that differs from its nominal.
+        A probe and a multiple of it, in all but its :attr:`shape`, are told apart by the fit; another shape (width of
+        a detent) needs a probe of its own. Every parameter has a size in at least one probe that differs from its nominal.
         """
 
     def is_itself(self, values: Values) -> bool:

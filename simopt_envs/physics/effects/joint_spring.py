@@ -22,6 +22,7 @@ class JointSpring(Effect):
 
     name = "joint_spring"
     law = "f = -k (q - q_ref)"
+    shape = ("reference",)
 
     def places(self, model: mujoco.MjModel) -> tuple[str, ...]:
         """See :meth:`Effect.places`."""

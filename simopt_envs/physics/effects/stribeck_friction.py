@@ -28,6 +28,7 @@ class StribeckFriction(Effect):
 
     name = "stribeck_friction"
     law = "f = -(F + B exp(-(v/vs)^2)) sign(v)"
+    shape = ("velocity",)
 
     def places(self, model: mujoco.MjModel) -> tuple[str, ...]:
         """See :meth:`Effect.places`."""
