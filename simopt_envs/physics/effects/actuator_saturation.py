@@ -21,6 +21,7 @@ class ActuatorSaturation(Effect):
 
     name = "actuator_saturation"
     law = "f = clip(f_drive, -L, L)"
+    shape = ("limit",)
 
     def places(self, model: mujoco.MjModel) -> tuple[str, ...]:
         """See :meth:`Effect.places`."""
@@ -41,6 +42,6 @@ class ActuatorSaturation(Effect):
         return (Parameter("limit", drive_unit(model, drive), limit, 1e-9 * limit, 10 * limit, "log", (write,)),)
 
     def probes(self, model: mujoco.MjModel, place: str, motion: Motion) -> tuple[dict[str, float], ...]:
-        """Limits below the greatest force, which is one to two times the root mean square, or more."""
+        """Limits below the greatest force, which is one to three times the root mean square."""
         force = drive_force(model, object_name(place), motion)
-        return tuple({"limit": part * force} for part in (2.0, 1.4, 1.0))
+        return tuple({"limit": part * force} for part in (3.0, 2.0, 1.4, 1.0, 0.7))
