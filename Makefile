@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv/installed
 ROBOTICS := .venv-robotics/installed
 
-.PHONY: demo test test-slow lint venv venv-robotics experiments clean
+.PHONY: demo test test-slow lint venv venv-robotics experiments experiments-quick hidden-effects hidden-effects-quick clean
 
 demo: $(VENV)
 	.venv/bin/simopt-envs demo --task drawer --out out/demo
@@ -14,6 +14,24 @@ test: $(VENV) $(ROBOTICS)
 
 test-slow: $(VENV)
 	.venv/bin/python -m pytest -m slow
+
+# The paper's questions: hours; the quick ones a quarter of an hour. Both go on where they were stopped.
+experiments: $(VENV)
+	.venv/bin/python -m baselines.experiments
+
+experiments-quick: $(VENV)
+	.venv/bin/python -m baselines.experiments --quick --docs out/experiments/docs
+
+# The gap workflow on systems in which an effect is hidden; it never sees the folder of labels.
+HIDDEN := out/hidden_effects
+COUNT ?=
+hidden-effects: $(VENV)
+	.venv/bin/python -m benchmarks.hidden_effects.generate --split test --out $(HIDDEN)/cases --labels $(HIDDEN)/labels
+	.venv/bin/python -m benchmarks.hidden_effects.run --cases $(HIDDEN)/cases --out $(HIDDEN)/found $(if $(COUNT),--count $(COUNT))
+	.venv/bin/python -m benchmarks.hidden_effects.score --gaps $(HIDDEN)/found --labels $(HIDDEN)/labels --figure $(HIDDEN)/confusion.png
+
+hidden-effects-quick:
+	$(MAKE) hidden-effects COUNT=30
 
 lint: $(VENV)
 	.venv/bin/ruff check .

@@ -7,6 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from conftest import needs_batch
+from gap_plant import MODEL, record
 
 README = Path(__file__).parents[1] / "README.md"
 FEWER_STEPS = {  # text in a block marked "tests: fewer steps" -> what is run
@@ -29,13 +30,20 @@ def python_blocks():
 
 @needs_batch
 @pytest.mark.filterwarnings("ignore::UserWarning")
-def test_the_blocks_run(capsys):
+def test_the_blocks_run(capsys, tmp_path, monkeypatch):
     pytest.importorskip("torch")
+    monkeypatch.chdir(tmp_path)
+    Path("arm.xml").write_text(MODEL)
+    for i, recording in enumerate(
+        record(lambda q, v: np.array([0.0, -0.4 * np.tanh(v[1] / 0.01)]), np.random.default_rng(1))
+    ):
+        recording.save(f"run_{i + 1}.csv")
     scope = {}
     for code in python_blocks():
         exec(compile(code, "README.md", "exec"), scope)
     out = capsys.readouterr().out
     assert "drawer_damping = 35 N s/m" in out
+    assert "coulomb_friction at joint:elbow: frictionloss 0.4" in out
     assert len(re.findall(r"^[01]\.\d+ \[", out, re.MULTILINE)) == 2  # two iterations were printed
 
     trainer, robot = scope["HillClimbing"](), scope["Robot"](gym.make("SimOpt/Drawer-v0"))

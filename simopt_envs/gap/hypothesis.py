@@ -108,12 +108,11 @@ class Hypothesis:
         u[: self.num_plain] = 0.0
         return u
 
-    def values(self, candidate: Candidate, u: Array) -> dict[str, float]:
-        """A candidate's parameters by their short names, at u (d,)."""
-        xi = self.xi(u[None])[0]
-        return {
-            self.space.names[i].removeprefix(candidate.full_name("")): float(xi[i]) for i in self.columns[candidate]
-        }
+    def is_itself(self, candidate: Candidate, u: Array) -> bool:
+        """Whether a candidate's parameters at u (d,) are what its name means."""
+        xi, prefix = self.xi(u[None])[0], candidate.full_name("")
+        values = {self.space.names[i].removeprefix(prefix): float(xi[i]) for i in self.columns[candidate]}
+        return candidate.effect.is_itself(self.plain.model, candidate.place, self.motion, values)
 
     def amounts(self, candidate: Candidate) -> list[int]:
         """The columns of a candidate that say how much of the effect there is, not what shape it has."""

@@ -124,11 +124,6 @@ class Score:
         return self.fitted + self.held_out
 
     @property
-    def values(self) -> dict[str, float]:
-        """Its parameters, by their short names."""
-        return self.trial.hypothesis.values(self.candidate, self.trial.fit.u)
-
-    @property
     def earned(self) -> bool:
         """Whether it may be called missing: it must show in what was fitted, and in recordings that no fit saw.
 
@@ -136,7 +131,11 @@ class Score:
         """
         stood_in_for = self.candidate.effect.name in SPEAKS_FOR.values() and self.of_prior > 0.5 * FAR**2
         least = 0.0 if stood_in_for else EVIDENCE
-        return self.fitted > least and self.held_out > least and self.candidate.effect.is_itself(self.values)
+        return (
+            self.fitted > least
+            and self.held_out > least
+            and self.trial.hypothesis.is_itself(self.candidate, self.trial.fit.u)
+        )
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ Tasks, environments and the driver see only :class:`Simulation`. :class:`SingleS
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import mujoco
@@ -59,11 +60,17 @@ class Simulation(Protocol):
 
 
 class SingleSimulation:
-    """One world on plain ``mujoco.mj_step``."""
+    """One world on plain ``mujoco.mj_step``.
+
+    Attributes:
+        on_timestep: called after each step of the model within :meth:`step` with its number, from 1 on: a logger that
+            is faster than the commands.
+    """
 
     num_worlds = 1
 
     def __init__(self, model: mujoco.MjModel, space: ParameterSpace):
+        self.on_timestep: Callable[[int], None] | None = None
         self.model = model
         self.mj_data = mujoco.MjData(model)
         self._writer = ModelWriter(model, space)
@@ -99,7 +106,12 @@ class SingleSimulation:
         """See :meth:`Simulation.step`."""
         before = self._warnings()
         self.mj_data.ctrl[:] = ctrl[0]
-        mujoco.mj_step(self.model, self.mj_data, substeps)
+        if self.on_timestep is None:
+            mujoco.mj_step(self.model, self.mj_data, substeps)
+        else:
+            for number in range(1, substeps + 1):
+                mujoco.mj_step(self.model, self.mj_data)
+                self.on_timestep(number)
         mujoco.mj_step1(self.model, self.mj_data)
         return np.array([self._warnings() != before])
 

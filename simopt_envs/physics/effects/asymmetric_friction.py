@@ -47,6 +47,6 @@ class AsymmetricFriction(Effect):
         force = probe_force(model, object_name(place), motion)
         return tuple({"frictionloss": force, "difference": difference} for difference in (force, -force))
 
-    def is_itself(self, values: Values) -> bool:
+    def is_itself(self, model: mujoco.MjModel, place: str, motion: Motion, values: Values) -> bool:
         """A difference below half the level is what a symmetric friction and a constant force are called."""
         return abs(values["difference"]) > _LEAST_DIFFERENCE * values["frictionloss"]

@@ -75,10 +75,10 @@ class Effect(ABC):
         ``model`` is the one that ``motion`` is of, without the effect's structure.
 
         A probe and a multiple of it, in all but its :attr:`shape`, are told apart by the fit; another shape (width of
-        a detent) needs a probe of its own. Every parameter has a size in at least one probe that differs from its nominal.
+        a detent) needs a probe of its own. Every parameter differs from its nominal in at least one probe.
         """
 
-    def is_itself(self, values: Values) -> bool:
+    def is_itself(self, model: mujoco.MjModel, place: str, motion: Motion, values: Values) -> bool:
         """Whether fitted values are what the effect's name means, where other effects can look the same."""
         return True
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mujoco
 
-from simopt_envs.physics.effects.effect import Effect, Motion, object_name
+from simopt_envs.physics.effects.effect import Effect, Motion, Values, object_name
 from simopt_envs.physics.effects.joints import (
     add_passive_motor,
     dof,
@@ -60,3 +60,7 @@ class StribeckFriction(Effect):
         return tuple(
             {"frictionloss": force, "breakaway": force, "velocity": fraction * speed} for fraction in (0.05, 0.2, 0.6)
         )
+
+    def is_itself(self, model: mujoco.MjModel, place: str, motion: Motion, values: Values) -> bool:
+        """A peak as wide as the motion is fast is no peak: it bends the friction of a joint that never leaves it."""
+        return values["velocity"] < float(motion.speed[dof(model, object_name(place))])

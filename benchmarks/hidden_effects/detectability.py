@@ -1,0 +1,270 @@
+"""How large an effect must be to be seen at all: from the truth's own simulation, before anything is named.
+
+An effect moves the recordings by d(m). White noise, starts that are uncertain, and plain parameters that are known only
+to their priors hide part of it: what is left, in standard deviations, is sqrt(d' (Sigma + A A')^-1 d), A holding the
+derivatives by starts and plain parameters times their prior deviations (the local Fisher information, the nuisances
+marginalised). The least detectable magnitude has 5 of them.
+
+    python -m benchmarks.hidden_effects.detectability [PLANT ...]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.hidden_effects.catalogue import EFFECTS, Effect
+from benchmarks.hidden_effects.outside import OUTSIDE
+from benchmarks.hidden_effects.plants import RECORDINGS, Array, Motion, Plant, nominal_model, plants
+from benchmarks.hidden_effects.truth import Diverged, Law, Run, World, plain_parameters
+
+FILE = Path(__file__).with_name("detectable.json")
+SIGMAS = 5.0
+EQUIVALENT = 0.99
+"""Effects whose projected directions correlate by this much cannot be told apart."""
+SIMILAR = 0.9
+"""The table lists others from here up."""
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """A piece of a recording that is predicted in one go.
+
+    Attributes:
+        motion: up to its end.
+        commands: as logged in the unchanged system.
+        first: sample at which the simulation starts.
+        start: state there; None: set down at rest, the lead simulated too.
+    """
+
+    motion: Motion
+    commands: Array
+    first: int
+    start: tuple[Array, Array] | None
+
+
+def reduced(vector: Array, nuisance: Array) -> Array:
+    """(I + A A')^-1/2 v: what nuisances of unit variance leave of a whitened vector (n,) or of columns (n, k).
+
+    Args:
+        vector: (n,) or (n, k).
+        nuisance: A (n, p).
+    """
+    u, s, _ = np.linalg.svd(nuisance, full_matrices=False)
+    shrink = 1 - 1 / np.sqrt(1 + s**2)
+    return vector - (u * shrink) @ (u.T @ vector)
+
+
+class Observability:
+    """The recordings of one plant with nothing hidden, and how a hidden law would show in them."""
+
+    def __init__(self, plant: Plant, seed: int = 0):
+        self.plant = plant
+        self._plain = {"latency": 1e-3}
+        self._stretches = self._cut(np.random.default_rng(seed))
+        self._base = self._columns(())
+        starts = self._start_sensitivity()
+        self._starts = starts
+        parameters = plain_parameters(plant)
+        columns = [
+            np.concatenate(self._whitened(self._columns((), self._plain | {name: self._plain.get(name, 0.0) + sd})))
+            for name, sd in parameters.items()
+        ]
+        self._nuisance = np.stack(columns, axis=1)
+
+    def direction(self, law: Law) -> Array:
+        """Whitened and projected change of all recordings that a law makes; its norm is in standard deviations.
+
+        Raises:
+            Diverged: where the law makes the simulation run away.
+        """
+        left = reduced(np.concatenate(self._whitened(self._columns((law,)))), self._nuisance)
+        return left * np.sqrt(RECORDINGS / self.plant.analysed)
+
+    def _cut(self, rng: np.random.Generator) -> list[Stretch]:
+        world, stretches = World(self.plant, (), self._plain), []
+        for i in range(self.plant.analysed):
+            motion = self.plant.motion(i, rng)
+            samples = len(motion.reference) - motion.lead
+            run = world.run(motion, rng.normal(size=(samples, len(self.plant.columns))) * self.plant.sigma)
+            if self.plant.window is None:
+                stretches.append(Stretch(motion, run.commands, 0, None))
+                continue
+            length = round(self.plant.window * self.plant.rate)
+            for first in range(0, samples - length, length):
+                end = motion.lead + first + length + 1
+                piece = Motion(motion.reference[:end], motion.lead, motion.qpos)
+                stretches.append(
+                    Stretch(piece, run.commands[:end], motion.lead + first, (run.qpos[first], run.qvel[first]))
+                )
+        return stretches
+
+    def _columns(self, laws: Sequence[Law], plain: dict[str, float] | None = None) -> list[Array]:
+        world = World(self.plant, laws, self._plain if plain is None else plain)
+        return [self._run(world, stretch).columns for stretch in self._stretches]
+
+    @staticmethod
+    def _run(world: World, stretch: Stretch, shift: tuple[Array, Array] | None = None) -> Run:
+        return world.run(
+            stretch.motion, commands=stretch.commands, first=stretch.first, start=stretch.start, shift=shift
+        )
+
+    def _start_sensitivity(self) -> list[Array]:
+        """Per stretch, the change of the (whitened, flattened) columns by each number of the start, prior-scaled."""
+        model = nominal_model(self.plant.name)
+        nv = model.nv
+        unsure = [d for d in range(nv) if not model.joint(model.dof_jntid[d]).name.startswith(self.plant.exact)]
+        position = 20 * self.plant.noise["qpos"]
+        deviation = np.r_[np.full(nv, position), np.full(nv, position * self.plant.rate / 5)]
+        world, step = World(self.plant, (), self._plain), 0.1
+        changes = []
+        for i in (*unsure, *(nv + dof for dof in unsure)):
+            shift = np.eye(2 * nv)[i] * deviation * step
+            runs = [self._run(world, s, (shift[:nv], shift[nv:])) for s in self._stretches]
+            changes.append([self._scaled(run.columns, b) / step for run, b in zip(runs, self._base, strict=True)])
+        return [np.stack(parts, axis=1) for parts in zip(*changes, strict=True)]
+
+    def _scaled(self, columns: Array, base: Array) -> Array:
+        return np.ravel((columns - base) / self.plant.sigma)
+
+    def _whitened(self, columns: list[Array]) -> list[Array]:
+        """Changes against the base per stretch, in noise units, what uncertain starts would explain shrunk."""
+        return [reduced(self._scaled(c, b), s) for c, b, s in zip(columns, self._base, self._starts, strict=True)]
+
+
+@dataclass(frozen=True)
+class Found:
+    """What one magnitude does.
+
+    Attributes:
+        magnitude: that was tried.
+        sigmas: that it makes.
+        direction: of the change.
+    """
+
+    magnitude: float
+    sigmas: float
+    direction: Array
+
+    @property
+    def off(self) -> float:
+        """Logarithm of how far from 5 sigmas."""
+        return float(np.log(max(self.sigmas, 1e-9) / SIGMAS))
+
+
+def least_detectable(
+    observability: Observability, effect: Effect, place: str, same_form: bool, guess: float | None = None
+) -> Found | None:
+    """What a magnitude that makes about 5 sigmas does, or the largest usable one; None where that makes nothing.
+
+    Args:
+        observability: of the plant.
+        effect: one of the catalogue's.
+        place: ``kind:name``.
+        same_form: which variant.
+        guess: a magnitude to start from; the effect's own by default.
+
+    """
+    plant, name = observability.plant, place.split(":")[1]
+    limit = effect.limit(plant, name)
+    magnitude = min(effect.guess(plant, name) if guess is None else guess, limit)
+    tried: list[Found] = []
+
+    def direction_of(magnitude: float) -> Array:
+        law, _ = effect.build(plant, name, magnitude, same_form, np.random.default_rng(0))
+        return observability.direction(law)
+
+    trace = direction_of(0.0) if effect.sets_apart else 0.0
+    for _ in range(8):
+        try:
+            direction = direction_of(magnitude) - trace
+        except Diverged:
+            limit = magnitude / 2
+            magnitude /= 3
+            continue
+        tried.append(Found(magnitude, float(np.linalg.norm(direction)), direction))
+        following = min(_next_magnitude(tried), limit)
+        if abs(tried[-1].off) < np.log(2.5) or abs(following / magnitude - 1) < 0.01:
+            break
+        magnitude = following
+    best = min(tried, key=lambda f: abs(f.off), default=None)
+    return best if best is not None and best.sigmas > 0.1 else None
+
+
+def _next_magnitude(tried: Sequence[Found]) -> float:
+    """Towards 5 sigmas: by proportion, or between the nearest on both sides, as thresholds are no proportions."""
+    low = max((f for f in tried if f.off < 0), key=lambda f: f.magnitude, default=None)
+    high = min((f for f in tried if f.off >= 0), key=lambda f: f.magnitude, default=None)
+    if low is not None and high is not None:
+        share = float(np.clip(low.off / (low.off - high.off), 0.2, 0.8))
+        return float(low.magnitude * (high.magnitude / low.magnitude) ** share)
+    return tried[-1].magnitude * float(np.clip(np.exp(-tried[-1].off), 1 / 30, 30 if tried[-1].sigmas > 0.1 else 2))
+
+
+def analyse(plant: Plant, before: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Least detectable magnitudes and look-alikes of everything in a plant, keyed as :func:`key` says.
+
+    Args:
+        plant: to be analysed.
+        before: an earlier answer, to start from.
+    """
+    observability = Observability(plant)
+    found: dict[str, Found] = {}
+    for effect in (*EFFECTS.values(), *OUTSIDE.values()):
+        places = effect.places(plant)
+        for place in places if effect.name in EFFECTS else places[-2:]:
+            for same_form in effect.forms if effect.forms_differ else effect.forms[:1]:
+                guess = before.get(key(effect, place, same_form), {}).get("least")
+                answer = least_detectable(observability, effect, place, same_form, guess)
+                if answer is not None:
+                    found[key(effect, place, same_form)] = answer
+                    print(
+                        f"{plant.name}: {key(effect, place, same_form)}: {answer.magnitude:.4g} makes"
+                        f" {answer.sigmas:.2f} sigma",
+                        flush=True,
+                    )
+    units = np.stack([f.direction / np.linalg.norm(f.direction) for f in found.values()])
+    correlation = np.abs(units @ units.T)
+    keys = list(found)
+    result: dict[str, dict[str, Any]] = {}
+    for i, (name, answer) in enumerate(found.items()):
+        alike: dict[str, float] = {}
+        for j in np.argsort(-correlation[i]):
+            other = keys[j].split("#")[0]
+            if other == name.split("#")[0] or other.split("@")[0] not in EFFECTS or correlation[i, j] < SIMILAR:
+                continue
+            alike.setdefault(other, round(float(correlation[i, j]), 4))
+        result[name] = {
+            # What is left to go to 5 sigmas is extrapolated.
+            "least": answer.magnitude * SIGMAS / answer.sigmas,
+            "tried": answer.magnitude,
+            "sigmas": round(answer.sigmas, 3),
+            "alike": alike,
+        }
+    return result
+
+
+def key(effect: Effect, place: str, same_form: bool) -> str:
+    """Name of an entry of the table: ``effect@place``, and the form where that matters."""
+    return f"{effect.name}@{place}" + ("#same" if same_form and effect.forms_differ else "")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Compute the least detectable magnitudes.")
+    parser.add_argument("plants", nargs="*", default=None)
+    names = parser.parse_args().plants or list(plants())
+    for name in names:
+        table = json.loads(FILE.read_text()) if FILE.exists() else {}
+        answer = analyse(plants()[name], table.get(name, {}))
+        table = json.loads(FILE.read_text()) if FILE.exists() else {}
+        FILE.write_text(json.dumps(table | {name: answer}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

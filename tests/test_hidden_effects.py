@@ -1,0 +1,225 @@
+import json
+import subprocess
+import sys
+
+import mujoco
+import numpy as np
+import pytest
+
+from benchmarks.hidden_effects import laws
+from benchmarks.hidden_effects.cases import FIRST_SEED, LEVELS, Case, Hidden, cases
+from benchmarks.hidden_effects.catalogue import EFFECTS
+from benchmarks.hidden_effects.detectability import reduced
+from benchmarks.hidden_effects.generate import column_names, simulate, write_case
+from benchmarks.hidden_effects.outside import OUTSIDE
+from benchmarks.hidden_effects.plants import RECORDINGS, nominal_model, plants
+from benchmarks.hidden_effects.score import Answer, Rate, confusion, magnitude_errors, rates
+from benchmarks.hidden_effects.truth import HALF_STEP_LEAD, TIMESTEP, World, delayed
+
+FRICTION = Hidden("coulomb_friction", "joint:elbow", 0.05, False, 10.0, False)
+
+
+def test_nothing_of_the_library_is_imported():
+    modules = "generate, score, detectability, outside"
+    code = f"import sys; from benchmarks.hidden_effects import {modules}; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    assert "benchmarks.hidden_effects.truth" in loaded
+    assert not {name.split(".")[0] for name in loaded} & {"simopt_envs", "wrappers", "baselines", "gymnasium"}
+
+
+def test_a_case_is_the_same_each_time_and_another_seed_is_another(tmp_path):
+    case = Case(5, "two_link", "single", (FRICTION,))
+    first, second = (write_case(case, tmp_path / name, tmp_path / f"{name}_labels") for name in ("a", "b"))
+    for file in sorted(first.iterdir()):
+        assert file.read_bytes() == (second / file.name).read_bytes()
+    other, _, _ = simulate(Case(6, "two_link", "single", (FRICTION,)))
+    mine = np.loadtxt(first / "rec_0.csv", delimiter=",", skiprows=1)
+    assert np.abs(other[0] - mine).max() > 0.01
+
+
+def test_the_case_folder_holds_model_and_recordings_and_no_word_of_the_label(tmp_path):
+    case = Case(5, "two_link", "single", (FRICTION,))
+    folder = write_case(case, tmp_path / "cases", tmp_path / "labels")
+    assert {file.name for file in folder.iterdir()} == {"model.xml", *(f"rec_{i}.csv" for i in range(RECORDINGS))}
+    assert (folder / "model.xml").read_text().strip() == plants()["two_link"].xml.strip()
+    text = "".join(file.read_text() for file in folder.iterdir()) + folder.name
+    label = json.loads((tmp_path / "labels" / f"{case.name}.json").read_text())
+    words = {"coulomb", "friction", "hidden", "single", *map(str, label["plain"].values())}
+    assert not [word for word in words if word in text]
+    assert label["effects"][0]["where"] == "joint:elbow"
+    assert label["effects"][0]["parameters"] == {"frictionloss": 0.05}
+    assert column_names("two_link") == (folder / "rec_0.csv").read_text().splitlines()[0].split(",")
+
+
+def replay_error(law):
+    """Mean square of a nominal replay's error in units of the noise, over the recordings that start at rest."""
+    plant, model = plants()["two_link"], nominal_model("two_link")
+    rng, world, data = np.random.default_rng(1), World(plant, law), mujoco.MjData(model)
+    steps, squares = round(1 / plant.rate / model.opt.timestep), []
+    for i in range(RECORDINGS):
+        motion = plant.motion(i, rng)
+        run = world.run(motion)
+        measured = run.columns + rng.normal(size=run.columns.shape) * plant.sigma
+        if i % 3 == 2:
+            continue
+        mujoco.mj_resetData(model, data)
+        data.qpos[:], data.qvel[:] = run.qpos[0], run.qvel[0]
+        share = HALF_STEP_LEAD / model.opt.timestep  # of the first step, in which the command before is in force
+        for k, command in enumerate(run.commands[motion.lead :], motion.lead):
+            mujoco.mj_kinematics(model, data)
+            predicted = np.concatenate([data.qpos, data.site("tip").xpos])
+            squares.append(((predicted - measured[k - motion.lead]) / plant.sigma) ** 2)
+            for step in range(steps):
+                data.ctrl[:] = command if step else share * run.commands[k - 1] + (1 - share) * command
+                mujoco.mj_step(model, data)
+    return np.mean(squares)
+
+
+def test_the_nominal_model_replays_what_hides_nothing_and_not_what_hides_friction():
+    assert replay_error(()) < 1.5  # the noise, and what steps four times longer do
+    assert replay_error((laws.LuGre("elbow", 0.3, 0.3),)) > 10.0
+
+
+def test_commands_arrive_late_by_exactly_the_delay():
+    rng, substeps = np.random.default_rng(0), 20
+    signal = rng.normal(size=(6, 2))
+    for delay in (0.0, 0.3e-3, 7e-3, 23e-3):
+        arrived = np.concatenate([delayed(signal[: k + 1], k, substeps, delay) for k in range(6)])
+        fine = np.repeat(signal, substeps * 10, axis=0)  # a tenth of a step at a time
+        shift = round(delay / TIMESTEP * 10)
+        late = np.concatenate([np.repeat(signal[:1], shift, axis=0), fine])[: len(fine)]
+        np.testing.assert_allclose(arrived, late.reshape(-1, 10, 2).mean(axis=1), atol=1e-12)
+
+
+def test_nuisances_hide_their_own_direction_and_no_other():
+    nuisance = np.zeros((5, 1))
+    nuisance[0] = 3.0
+    left = reduced(np.array([2.0, 1.0, 0, 0, 0]), nuisance)
+    np.testing.assert_allclose(left, [2 / np.sqrt(10), 1, 0, 0, 0], atol=1e-12)
+    rng = np.random.default_rng(0)
+    vector, several = rng.normal(size=8), rng.normal(size=(8, 3))
+    expected = vector @ np.linalg.solve(np.eye(8) + several @ several.T, vector)
+    np.testing.assert_allclose(np.sum(reduced(vector, several) ** 2), expected, rtol=1e-10)
+
+
+def any_place(effect):
+    """The first plant that has a place for an effect, and the last place there."""
+    return next((plant, places[-1]) for plant in plants().values() if (places := effect.places(plant)))
+
+
+def columns(plant, law):
+    motion = plant.motion(1, np.random.default_rng(0))
+    return World(plant, law).run(motion).columns / plant.sigma
+
+
+@pytest.mark.parametrize("name", [*EFFECTS, *OUTSIDE])
+def test_every_effect_shows_and_fades_with_its_magnitude(name):
+    effect = (EFFECTS | OUTSIDE)[name]
+    plant, place = any_place(effect)
+    where = place.split(":")[1]
+
+    def change(magnitude):
+        law, parameters = effect.build(plant, where, magnitude, effect.forms[0], np.random.default_rng(0))
+        assert all(np.isfinite(value) for value in parameters.values())
+        return np.abs(columns(plant, (law,)) - columns(plant, ())).max()
+
+    guess = effect.guess(plant, where)
+    assert change(min(5 * guess, effect.limit(plant, where))) > 0.3
+    # Motor and link apart leave a trace; a touch begins a step earlier or later; a mount would be too stiff.
+    if not effect.sets_apart and name not in ("contact_friction", "soft_mount"):
+        assert change(1e-4 * guess) < 0.1
+
+
+def test_the_splits_have_every_effect_twice_and_no_seed_in_common():
+    names = {}
+    for split, first in FIRST_SEED.items():
+        all_cases = cases(split)
+        assert all(first <= case.seed < first + 1000 for case in all_cases)
+        singles = [case.hidden[0] for case in all_cases if case.kind == "single"]
+        assert sorted(hidden.effect for hidden in singles) == sorted([*EFFECTS] * len(LEVELS))
+        assert {kind: sum(case.kind == kind for case in all_cases) for kind in ("null", "outside", "double")} == {
+            "null": 10,
+            "outside": 10,
+            "double": 10,
+        }
+        assert {case.plant for case in all_cases[:40]} == set(plants())
+        names[split] = {case.name for case in all_cases}
+        assert len(names[split]) == len(all_cases)
+    assert not names["dev"] & names["test"]
+
+
+def answer(kind, hidden, verdict, named, value=1.0):
+    def effect(name, number):
+        what, where = name.split("@")
+        return {"effect": what, "where": where, "parameters": {"frictionloss": number}, "same_form": True}
+
+    label = {
+        "case": "x",
+        "kind": kind,
+        "effects": [effect(name, 1.0) for name in hidden],
+        "ratio": 10.0,
+        "detectable": kind == "single",
+        "equivalents": ["payload@body:a"] if kind == "single" else [],
+    }
+    found = [effect(name, {"value": value, "unit": "N", "interval95": [value - 0.1, value + 0.1]}) for name in named]
+    gap = {"refit": 2.0, "after": 1.1, "noise_floor": 1.0}
+    return Answer(label, {"verdict": verdict, "effects": found, "candidates": [], "gap": gap})
+
+
+def shares(answers):
+    return {rate.name.strip(): (rate.hits, rate.of) for rate in rates(answers)}
+
+
+def test_the_score_of_right_answers_is_full_and_of_wrong_ones_empty():
+    friction, drag = "coulomb_friction@joint:a", "quadratic_drag@joint:a"
+    right = shares(
+        [
+            answer("single", [friction], "named", [friction]),
+            answer("single", [friction], "named", ["payload@body:a"]),  # an equivalent
+            answer("null", [], "none", []),
+            answer("outside", ["crosstalk@joint:a"], "unexplained", []),
+            answer("double", [friction, drag], "named", [drag, friction]),
+        ]
+    )
+    wrong = shares(
+        [
+            answer("single", [friction], "named", [drag], value=2.0),
+            answer("single", [friction], "named", [friction], value=2.0),
+            answer("null", [], "named", [drag]),
+            answer("outside", ["crosstalk@joint:a"], "named", [drag]),
+            answer("double", [friction, drag], "named", [drag]),
+        ]
+    )
+    assert right["named first, effect and place"] == (2, 2)
+    assert wrong["named first, effect and place"] == (1, 2)
+    assert right["wrong name given first"] == (0, 2)
+    assert wrong["wrong name given first"] == (1, 2)
+    assert right["false alarms on nulls"] == (0, 1)
+    assert wrong["false alarms on nulls"] == (1, 1)
+    assert right["outside the library: not named as something else"] == (1, 1)
+    assert wrong["outside the library: not named as something else"] == (0, 1)
+    assert right["two at once, both named"] == (1, 1)
+    assert wrong["two at once, both named"] == (0, 1)
+    assert right["95 % intervals that hold the truth (same form)"] == (3, 3)
+    assert wrong["95 % intervals that hold the truth (same form)"] == (1, 2)
+    assert right["excess gap removed by 80 % or more, when named"] == (2, 2)
+
+
+def test_magnitude_errors_and_confusion_count_what_they_say():
+    answers = [
+        answer("single", ["coulomb_friction@joint:a"], "named", ["coulomb_friction@joint:a"], value=1.3),
+        answer("single", ["quadratic_drag@joint:a"], "unexplained", []),
+        answer("null", [], "none", []),
+    ]
+    assert magnitude_errors(answers)[True] == pytest.approx([0.3])
+    rows, counts = confusion(answers)
+    assert counts.sum() == 3
+    assert counts[rows.index("coulomb_friction"), 0] == 1
+    assert counts[rows.index("quadratic_drag"), -1] == 1
+    assert counts[rows.index("nothing"), -2] == 1
+
+
+def test_wilson_interval():
+    low, high = Rate("", 9, 10).interval
+    assert (low, high) == pytest.approx((0.5958, 0.9821), abs=1e-3)
+    assert Rate("", 0, 0).interval == (0.0, 1.0)
