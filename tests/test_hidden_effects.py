@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.hidden_effects import laws
-from benchmarks.hidden_effects.cases import FIRST_SEED, LEVELS, Case, Hidden, cases
+from benchmarks.hidden_effects.cases import FIRST_SEED, LEVELS, Case, Hidden, cases, table
 from benchmarks.hidden_effects.catalogue import EFFECTS
 from benchmarks.hidden_effects.detectability import reduced
 from benchmarks.hidden_effects.generate import column_names, simulate, write_case
@@ -142,10 +142,13 @@ def test_the_splits_have_every_effect_twice_and_no_seed_in_common():
             "outside": 10,
             "double": 10,
         }
-        assert {case.plant for case in all_cases[:40]} == set(plants())
+        assert {case.plant for case in all_cases[:40]} == set(table())
+        assert {case.plant for case in cases(split, ("two_link", "arm3"))} == {"two_link", "arm3"}
         names[split] = {case.name for case in all_cases}
         assert len(names[split]) == len(all_cases)
     assert not names["dev"] & names["test"]
+    with pytest.raises(ValueError, match="no such plants: three_link"):
+        cases("dev", ("three_link",))
 
 
 def answer(kind, hidden, verdict, named, value=1.0):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Literal
@@ -70,16 +71,22 @@ def table() -> dict[str, dict[str, dict[str, object]]]:
     return dict(json.loads(FILE.read_text()))
 
 
-def cases(split: str) -> list[Case]:
+def cases(split: str, among: Sequence[str] | None = None) -> list[Case]:
     """All cases of a split, interleaved so that any first part of them holds every kind.
 
     Args:
         split: ``"dev"`` or ``"test"``.
+        among: names of plants; all that the table has by default.
+
+    Raises:
+        ValueError: for an unknown split or plant, and where an effect can be detected in none of the plants.
     """
     if split not in FIRST_SEED:
         raise ValueError(f"unknown split {split!r}; there are {', '.join(FIRST_SEED)}")
     first, shift = FIRST_SEED[split], list(FIRST_SEED).index(split)
-    names = [name for name in plants() if name in table()]
+    names = [name for name in plants() if name in (table() if among is None else among)]
+    if among is not None and (unknown := set(among) - set(table())):
+        raise ValueError(f"no such plants: {', '.join(sorted(unknown))}; there are {', '.join(table())}")
     groups: list[list[Case]] = [[], [], [], []]
     for i, effect in enumerate(EFFECTS.values()):
         for turn, level in enumerate(LEVELS):

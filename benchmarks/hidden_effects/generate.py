@@ -1,6 +1,7 @@
 """Write cases: a folder with the nominal model and recordings for the workflow, a label elsewhere for the score.
 
-    python -m benchmarks.hidden_effects.generate --split dev --out DIR --labels OTHER_DIR [--only single] [--count 20]
+    python -m benchmarks.hidden_effects.generate --split dev --out DIR --labels OTHER_DIR [--only single]
+        [--count 20] [--plants two_link arm3]
 
 Cases that are already there are kept.
 """
@@ -107,10 +108,13 @@ def main() -> None:
     parser.add_argument("--labels", type=Path, required=True)
     parser.add_argument("--only", choices=KINDS)
     parser.add_argument("--count", type=int)
+    parser.add_argument("--plants", nargs="+", help="all by default")
     arguments = parser.parse_args()
     if arguments.labels.resolve().is_relative_to(arguments.out.resolve()):
         parser.error(f"labels {arguments.labels} must not lie inside the cases' folder {arguments.out}")
-    chosen = [case for case in cases(arguments.split) if arguments.only in (None, case.kind)][: arguments.count]
+    chosen = [case for case in cases(arguments.split, arguments.plants) if arguments.only in (None, case.kind)][
+        : arguments.count
+    ]
     for i, case in enumerate(chosen, 1):
         if (arguments.labels / f"{case.name}.json").exists():
             continue

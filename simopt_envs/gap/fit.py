@@ -172,6 +172,7 @@ def fit(misfit: Misfit, start: Array, iterations: int, known: Array | None = Non
         bounds=[hypothesis.low, hypothesis.high],
         jacobian=jacobian,
         xtol=1e-2,
+        x_scale="jac",  # damping relative to what the data say of each coordinate
         mu_min=1e-3,
         mu_max=1e4,
         mu_factor=10.0,

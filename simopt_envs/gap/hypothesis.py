@@ -177,7 +177,7 @@ class HypothesisSimulator:
         """Commands of the model's controls for each ξ and window, (n w, N, nu)."""
         given = self._given
         late = self._commands.arriving(given.past_commands, given.commands, xi, self._timestep)
-        return late[..., self._sources].reshape(-1, given.commands.shape[1], len(self._sources))
+        return late[..., self._sources].reshape(len(xi) * len(given), given.commands.shape[1], len(self._sources))
 
     def _meant(self, starts: States, xi: Array) -> States:
         """The states to start from, for each ξ, so that sensors show the measured starts."""
