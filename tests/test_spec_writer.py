@@ -3,16 +3,20 @@
 import ctypes
 import difflib
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
+import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
 
+import simopt_envs  # noqa: F401 - registers the environments
 from simopt_envs.physics import ModelWriter, Parameter, ParameterSpace, Write
 from simopt_envs.physics.columns import acts_on_columns
 from simopt_envs.physics.effects import EFFECTS, Motion
 from simopt_envs.physics.spec_writer import write_spec
+from simopt_envs.physics.writer import field_elements, model_field
 
 XML = """
 <mujoco>
@@ -176,6 +180,22 @@ def test_degrees_frames_and_inherited_ranges():
         np.testing.assert_allclose(getattr(compiled, field), getattr(truth, field), rtol=0, atol=1e-12, err_msg=field)
     np.testing.assert_array_equal(compiled.actuator_ctrlrange, commanded)
     np.testing.assert_allclose(compiled.jnt_range[0], np.radians([-90, 45]) + 0.1)
+
+
+@pytest.mark.parametrize("name", ["Drawer", "SwingPeg"])
+def test_a_spec_holds_all_parameters_of_the_environments(name):
+    task = gym.make(f"SimOpt/{name}-v0").unwrapped.task
+    spec = task.make_spec()
+    space = task.parameters.subset([n for n in task.parameters.names if n != "rope_bending_damping"])
+    z = space.to_unconstrained(space.nominal) + np.random.default_rng(0).uniform(-0.05, 0.05, len(space))
+    xi = np.clip(space.from_unconstrained(z), space.low, space.high)
+    model = spec.compile()
+    write_spec(spec, model, space, xi)
+    compiled, truth = spec.compile(), written_model(model, space, xi)
+    for write in (write for parameter in space for write in parameter.writes):
+        row = field_elements(model, replace(write, index=None))
+        kept, meant = (model_field(m, write.field).ravel()[row] for m in (compiled, truth))
+        np.testing.assert_allclose(kept, meant, rtol=1e-9, atol=1e-12, err_msg=str(write))
 
 
 def test_a_field_that_a_spec_cannot_hold_is_named_and_nothing_is_written():

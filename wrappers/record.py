@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,8 +15,10 @@ from numpy.typing import NDArray
 
 from simopt_envs.measured.channels import model_channels, read_channels
 from simopt_envs.measured.recording import Recording
+from simopt_envs.physics.parameters import unknown_name
 
 Array = NDArray[np.float64]
+_STREAM = 4  # sets the noise's generator apart from those of the other wrappers
 
 
 class RecordEpisodes(gym.Wrapper, RecordConstructorArgs):
@@ -35,10 +38,16 @@ class RecordEpisodes(gym.Wrapper, RecordConstructorArgs):
         clock: seconds, ``time.monotonic`` for a robot; None for the environment's own time step (``dt``, or else one
             over ``render_fps``).
         suffix: file format.
+        columns: what of it the robot measures, names or patterns such as ``"qpos/*"``; None for all. Commands are
+            always recorded.
+        noise: standard deviation of the noise of its sensors, by name or pattern of the columns, in their units. A
+            seeded ``reset`` seeds it.
+        per_step: measurements of a step of an environment of this package, as a robot's log is faster than its policy.
         minari_id: also keep the episodes in memory and, at ``close``, store them as this Minari data set.
 
     Raises:
-        ValueError: if names do not fit the spaces, or there is neither a clock nor a time step.
+        ValueError: if names do not fit the spaces, a pattern fits no column, there is neither a clock nor a time step,
+            or so many measurements of a step cannot be had.
         ImportError: if ``minari_id`` is given and Minari is not installed.
 
     Change log:
@@ -54,6 +63,9 @@ class RecordEpisodes(gym.Wrapper, RecordConstructorArgs):
         actions: Sequence[str] | None = None,
         clock: Callable[[], float] | None = None,
         suffix: Literal[".npz", ".csv", ".parquet"] = ".npz",
+        columns: Sequence[str] | None = None,
+        noise: Mapping[str, float] | None = None,
+        per_step: int = 1,
         minari_id: str | None = None,
     ):
         RecordConstructorArgs.__init__(
@@ -63,6 +75,9 @@ class RecordEpisodes(gym.Wrapper, RecordConstructorArgs):
             actions=actions,
             clock=clock,
             suffix=suffix,
+            columns=columns,
+            noise=noise,
+            per_step=per_step,
             minari_id=minari_id,
         )
         gym.Wrapper.__init__(self, env)
@@ -76,6 +91,14 @@ class RecordEpisodes(gym.Wrapper, RecordConstructorArgs):
             self._source = _ModelSource(env)
         else:
             self._source = _SpaceSource(env, observations, actions)
+        names = self._source.signal_names
+        self._kept = [names.index(name) for name in (names if columns is None else _matching(columns, names))]
+        self._noise = np.zeros(len(names))
+        for pattern, std in (noise or {}).items():
+            self._noise[[names.index(name) for name in _matching([pattern], names)]] = std
+        self._rng = np.random.default_rng()
+        if per_step != 1:
+            self._measure_within_steps(per_step)
         self._minari = None if minari_id is None else _MinariEpisodes(minari_id)
         self._signals: list[Array] = []
         self._commands: list[Array] = []
@@ -85,6 +108,8 @@ class RecordEpisodes(gym.Wrapper, RecordConstructorArgs):
         """Write an episode that was cut short, reset, and begin the next."""
         self._write()
         observation, info = self.env.reset(seed=seed, options=options)
+        if seed is not None:
+            self._rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_STREAM,)))
         self._measure(observation)
         if self._minari:
             self._minari.begin(observation, seed, options)
@@ -111,13 +136,33 @@ class RecordEpisodes(gym.Wrapper, RecordConstructorArgs):
 
     def _measure(self, observation: Any) -> None:
         self._times.append(self._clock() if self._clock else len(self._times) * (self._period or 0.0))
-        self._signals.append(self._source.signal(observation))
+        signal = self._source.signal(observation)
+        self._signals.append(signal + self._noise * self._rng.standard_normal(signal.shape))
+
+    def _measure_within_steps(self, per_step: int) -> None:
+        """Measure so many times a step, the last time when it is over."""
+        env: Any = self.env.unwrapped
+        simulation: Any = getattr(env, "simulation", None)
+        task: Any = getattr(env, "task", None)
+        if not hasattr(simulation, "on_timestep") or task is None or self._period is None:
+            raise ValueError(f"per_step={per_step}: only environments of this package are measured within their steps")
+        every, rest = divmod(task.substeps, per_step) if per_step > 0 else (0, 1)
+        if rest:
+            raise ValueError(f"per_step must divide the {task.substeps} timesteps of a step, got {per_step}")
+        self._period /= per_step
+
+        def measure(number: int) -> None:
+            if number % every == 0 and number < task.substeps:
+                self._commands.append(self._source.command(None))
+                self._measure(None)
+
+        simulation.on_timestep = measure
 
     def _write(self) -> None:
         if self._commands:
             signals, commands = np.array(self._signals), np.array([*self._commands, self._commands[-1]])
             columns = dict(zip(self._source.command_names, commands.T, strict=True))
-            columns |= dict(zip(self._source.signal_names, signals.T, strict=True))
+            columns |= {self._source.signal_names[i]: signals[:, i] for i in self._kept}
             name = f"episode_{_next_number(self._folder):06d}"
             recording = Recording(np.array(self._times) - self._times[0], columns, name)
             self.recordings.append(recording.save(self._folder / f"{name}{self._suffix}"))
@@ -222,6 +267,14 @@ def _names(kind: str, names: Sequence[str] | None, space: gym.Space) -> list[str
     if isinstance(names, str) or len(names) != size:
         raise ValueError(f"the flattened {kind} has {size} numbers, got the names {names!r}")
     return list(names)
+
+
+def _matching(patterns: Sequence[str], names: Sequence[str]) -> list[str]:
+    """The names that some of the patterns fit, in their order; ValueError for a pattern that fits none."""
+    for pattern in patterns:
+        if not any(fnmatchcase(name, pattern) for name in names):
+            raise ValueError(unknown_name("column", pattern, names))
+    return [name for name in names if any(fnmatchcase(name, pattern) for pattern in patterns)]
 
 
 def _time_step(env: gym.Env) -> float:

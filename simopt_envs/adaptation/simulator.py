@@ -69,7 +69,7 @@ class EnvSimulator:
     To repeat a measured episode it also passes ``options["initial_observation"]``, (o,), and a seed.
 
     Args:
-        env: a registered id, or a function that makes one environment.
+        env: a registered id or its spec, which may carry arguments, or a function that makes one environment.
         vectorization_mode: how worlds run together. ``"native"``: the id's own vector environment, whose ``reset``
             takes all worlds' parameters as an array (n, d) and which has a ``parameter_source``; ``"sync"``,
             ``"async"``: Gymnasium's, over single environments. None: native where it can be had, else sync.
@@ -86,24 +86,25 @@ class EnvSimulator:
 
     def __init__(
         self,
-        env: str | Callable[[], gym.Env],
+        env: str | EnvSpec | Callable[[], gym.Env],
         vectorization_mode: VectorizationMode | None = None,
         num_envs: int = 256,
         engine: Engine | None = None,
         **options: Any,
     ):
-        self.env_id = env if isinstance(env, str) else getattr(env, "__name__", type(env).__name__)
         self.num_envs = num_envs
         self.engine: Engine = engine or LocalEngine()
         self._num_threads = self.engine.num_threads
         # The spec, not the id: where a task runs, the id need not be registered.
         self._spec: EnvSpec | None = None
         self._make_env: Callable[[], gym.Env]
-        if isinstance(env, str):
-            self._spec = gym.spec(env)
+        if isinstance(env, str | EnvSpec):
+            self._spec = gym.spec(env) if isinstance(env, str) else env
             self._make_env = partial(gym.make, self._spec)
+            self.env_id = self._spec.id
         else:
             self._make_env = env
+            self.env_id = getattr(env, "__name__", type(env).__name__)
         has_own = self._spec is not None and self._spec.vector_entry_point is not None
         if vectorization_mode == "native" and not has_own:
             raise ValueError(f'{self.env_id} has no vector environment of its own; use "sync" or "async"')
@@ -132,7 +133,8 @@ class EnvSimulator:
 
     def identity(self) -> dict[str, Any]:
         """What identifies it in a checkpoint."""
-        return {"env_id": self.env_id, **self._options}
+        arguments = {} if self._spec is None else self._spec.kwargs
+        return {"env_id": self.env_id, **arguments, **self._options}
 
     def make_vector_env(self, num_envs: int, distribution: Sampler, seed: int) -> VectorEnv:
         """See :meth:`Simulator.make_vector_env`. Worlds that are done are reset in the same step."""

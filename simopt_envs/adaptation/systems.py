@@ -9,6 +9,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import VectorEnv
 from numpy.typing import ArrayLike
 
@@ -25,7 +26,7 @@ class HiddenSystem:
     """An environment that plays the robot: it can be run and measured, and its ξ cannot be read.
 
     Args:
-        env: a registered id, or a function that makes one environment.
+        env: a registered id or its spec, which may carry arguments, or a function that makes one environment.
         parameters: name -> value of what differs from nominal; it is kept where only this system's episodes see it.
         noise: standard deviation of the sensor noise, in each channel's unit: a number for all channels, one per
             channel, or by name; a name may be a pattern such as ``"handle_*"``.
@@ -42,7 +43,7 @@ class HiddenSystem:
 
     def __init__(
         self,
-        env: str | Callable[[], gym.Env],
+        env: str | EnvSpec | Callable[[], gym.Env],
         parameters: Mapping[str, float],
         noise: PerChannel = 0.0,
         dropout: PerChannel = 0.0,

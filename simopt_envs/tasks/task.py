@@ -52,6 +52,10 @@ class Task(Protocol):
     observation_names: tuple[str, ...]
     discrepancy_weights: Array
 
+    def make_spec(self) -> mujoco.MjSpec:
+        """A fresh spec of the model at nominal ξ, with the structure of the effects that the task was made with."""
+        ...
+
     def make_model(self, visual: bool = True) -> mujoco.MjModel:
         """A fresh model at nominal ξ; without ``visual`` it lacks what is there only to be seen, and steps faster."""
         ...

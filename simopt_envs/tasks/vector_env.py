@@ -1,9 +1,10 @@
-"""The vector environment of a task: n worlds stepped together on all cores, a ξ per world."""
+"""The vector environment of a task: n worlds stepped together on all cores or on a GPU, a ξ per world."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from copy import deepcopy
+from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
@@ -12,16 +13,18 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from simopt_envs.physics.parameters import Array, ParameterSpace
-from simopt_envs.physics.simulation import BatchSimulation
+from simopt_envs.physics.arrays import namespace, to_numpy
+from simopt_envs.physics.parameters import Array, ParameterSpace, unknown_name
+from simopt_envs.physics.simulation import BatchSimulation, Simulation
 from simopt_envs.tasks.options import episode_parameters, start_qpos
 from simopt_envs.tasks.task import Task
 
 Worlds = NDArray[np.intp]
+Backend = Literal["mujoco", "warp"]
 
 
-class TaskVectorEnv(gym.vector.VectorEnv[Array, Array, NDArray[Any]]):
-    """n worlds of a task over :class:`BatchSimulation`.
+class TaskVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
+    """n worlds of a task, on the threads of MuJoCo or on MuJoCo Warp.
 
     World i, seeded with s + i, goes through what the single environment seeded so goes through. ``reset`` takes the
     options of :class:`~simopt_envs.tasks.env.TaskEnv`: parameter values are numbers or one per world, or an (n, d)
@@ -31,12 +34,18 @@ class TaskVectorEnv(gym.vector.VectorEnv[Array, Array, NDArray[Any]]):
     A world that diverges ends its episode: truncated, its observation the last valid one, its reward 0,
     ``info["diverged"]`` True. ``diverged_count`` counts them.
 
+    With the backend "warp" observations, rewards, flags and their infos are torch tensors on the device, in single
+    precision, and actions may be; ``info["parameters"]`` remains an array. ``final_obs`` then is one tensor (n, o), of
+    which ``_final_obs`` tells the rows that count.
+
     Args:
         task: the task.
         num_envs: n.
         max_episode_steps: steps after which an episode is truncated.
         autoreset_mode: when a world that is done is reset, as Gymnasium defines it.
-        num_threads: 0 for one per core.
+        num_threads: of "mujoco"; 0 for one per core.
+        backend: "mujoco", or "warp" for MuJoCo Warp.
+        device: of "warp": "cuda:0", "cpu", ...; None for the first GPU, or the CPU where there is none.
 
     Attributes:
         parameter_source: called with the ids (k,) of worlds that begin an episode without explicit parameters, at
@@ -50,6 +59,8 @@ class TaskVectorEnv(gym.vector.VectorEnv[Array, Array, NDArray[Any]]):
         max_episode_steps: int = 50,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         num_threads: int = 0,
+        backend: Backend = "mujoco",
+        device: str | None = None,
     ):
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, got {num_envs}")
@@ -57,7 +68,7 @@ class TaskVectorEnv(gym.vector.VectorEnv[Array, Array, NDArray[Any]]):
         self.task = task
         self.num_envs = num_envs
         self.max_episode_steps = max_episode_steps
-        self.simulation = BatchSimulation(task.make_model(visual=False), task.parameters, num_envs, num_threads)
+        self.simulation = _simulation(task, num_envs, num_threads, backend, device)
         self.parameters: ParameterSpace = task.parameters
         self.parameter_source: Callable[[Worlds], Array] | None = None
         self.discrepancy_weights = task.discrepancy_weights
@@ -72,9 +83,9 @@ class TaskVectorEnv(gym.vector.VectorEnv[Array, Array, NDArray[Any]]):
         self.diverged_count = 0
         self._rngs = [np_random(None)[0] for _ in range(num_envs)]
         self._xi = np.tile(self.parameters.nominal, (num_envs, 1))
-        self._steps = np.zeros(num_envs, dtype=np.int64)
-        self._done = np.zeros(num_envs, dtype=bool)
-        self._observation: Array = np.zeros((num_envs, *task.observation_space.shape))
+        self._steps = self.simulation.asarray(np.zeros(num_envs, dtype=np.int64))
+        self._done = self.simulation.asarray(np.zeros(num_envs, dtype=bool))
+        self._observation = self.simulation.asarray(np.zeros((num_envs, *task.observation_space.shape)))
 
     @property
     def dt(self) -> float:
@@ -83,7 +94,7 @@ class TaskVectorEnv(gym.vector.VectorEnv[Array, Array, NDArray[Any]]):
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Array, dict[str, Any]]:
+    ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode in every world, or in those of ``options["reset_mask"]``; see the class."""
         options = dict(options or {})
         mask = options.pop("reset_mask", None)
@@ -97,55 +108,53 @@ class TaskVectorEnv(gym.vector.VectorEnv[Array, Array, NDArray[Any]]):
                 if seeds[world] is not None:
                     self._rngs[world] = np_random(seeds[world])[0]
         self._begin(worlds, explicit[worlds] if "parameters" in options else None, options.get("initial_observation"))
-        return self._observation.copy(), {"parameters": self._xi.copy()}
+        return deepcopy(self._observation), {"parameters": self._xi.copy()}
 
-    def step(
-        self, actions: Array
-    ) -> tuple[Array, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Advance every world by ``dt``; worlds that are done are reset as ``autoreset_mode`` says."""
-        actions = np.clip(np.asarray(actions, dtype=np.float64), -1.0, 1.0)
+        xp = namespace(self._observation)
+        actions = xp.clip(self.simulation.asarray(actions), -1.0, 1.0)
         if actions.shape != self.action_space.shape:
             raise ValueError(f"actions must have shape {self.action_space.shape}, got {actions.shape}")
-        beginning = self._done.copy()  # with NEXT_STEP, these worlds spend this step on their reset
+        beginning = self._done  # with NEXT_STEP, these worlds spend this step on their reset
         if self.autoreset_mode is AutoresetMode.DISABLED and beginning.any():
-            raise RuntimeError(
-                f"worlds {np.flatnonzero(beginning).tolist()} are done; reset them (options['reset_mask'])"
-            )
+            raise RuntimeError(f"worlds {_which(beginning).tolist()} are done; reset them (options['reset_mask'])")
 
         diverged = self.simulation.step(self.task.control(self.simulation, actions), self.task.substeps) & ~beginning
         observation = self.task.observe(self.simulation)
         outcome = self.task.evaluate(self.simulation, actions)
         running = ~(diverged | beginning)
-        reward = np.where(running, outcome.reward, 0.0)
+        reward = xp.where(running, outcome.reward, 0.0)
         success = outcome.success & running
-        observation[diverged] = self._observation[diverged]
-        self._observation = observation
+        self._observation = xp.where(diverged[:, None], self._observation, observation)
         self._steps += 1
         self.diverged_count += int(diverged.sum())
 
-        terminated = np.zeros(self.num_envs, dtype=bool)
         truncated = (diverged | (self._steps >= self.max_episode_steps)) & ~beginning
         info: dict[str, Any] = {
             "is_success": success,
             "diverged": diverged,
-            "reward_terms": {name: np.where(running, term, 0.0) for name, term in outcome.terms.items()},
+            "reward_terms": {name: xp.where(running, term, 0.0) for name, term in outcome.terms.items()},
         }
         if self.autoreset_mode is AutoresetMode.SAME_STEP:
             self._autoreset_now(truncated, info)
         else:
-            self._begin(np.flatnonzero(beginning))
-            self._done = truncated.copy()
+            self._begin(_which(beginning))
+            self._done = deepcopy(truncated)
         info["parameters"] = self._xi.copy()
-        return self._observation.copy(), reward, terminated, truncated, info
+        return deepcopy(self._observation), reward, xp.zeros_like(truncated), truncated, info
 
-    def _autoreset_now(self, done: NDArray[np.bool_], info: dict[str, Any]) -> None:
+    def _autoreset_now(self, done: Any, info: dict[str, Any]) -> None:
         """SAME_STEP: keep the final observations and infos of the worlds that are done, then reset them."""
-        if not done.any():
+        worlds = _which(done)
+        if not len(worlds):
             return
-        final = np.full(self.num_envs, None, dtype=object)
-        for world in np.flatnonzero(done):
-            final[world] = self._observation[world].copy()
-        info["final_obs"], info["_final_obs"] = final, done
+        info["final_obs"], info["_final_obs"] = deepcopy(self._observation), done
+        if isinstance(done, np.ndarray):  # as Gymnasium has it
+            final = np.full(self.num_envs, None, dtype=object)
+            for world in worlds:
+                final[world] = self._observation[world].copy()
+            info["final_obs"] = final
         info["final_info"] = {
             "is_success": info["is_success"],
             "_is_success": done,
@@ -155,7 +164,7 @@ class TaskVectorEnv(gym.vector.VectorEnv[Array, Array, NDArray[Any]]):
             "_parameters": done,
         }
         info["_final_info"] = done
-        self._begin(np.flatnonzero(done))
+        self._begin(worlds)
 
     def _begin(self, worlds: Worlds, xi: Array | None = None, initial_observation: Array | None = None) -> None:
         """Start an episode in some worlds."""
@@ -173,3 +182,19 @@ class TaskVectorEnv(gym.vector.VectorEnv[Array, Array, NDArray[Any]]):
         self._observation[worlds] = self.task.observe(self.simulation)[worlds]
         self._steps[worlds] = 0
         self._done[worlds] = False
+
+
+def _simulation(task: Task, num_envs: int, num_threads: int, backend: Backend, device: str | None) -> Simulation:
+    model = task.make_model(visual=False)
+    if backend == "mujoco":
+        return BatchSimulation(model, task.parameters, num_envs, num_threads)
+    if backend == "warp":
+        from simopt_envs.physics.warp_simulation import WarpSimulation
+
+        return WarpSimulation(model, task.parameters, num_envs, device)
+    raise ValueError(unknown_name("backend", backend, ("mujoco", "warp")))
+
+
+def _which(mask: Any) -> Worlds:
+    """The worlds that a mask picks."""
+    return np.flatnonzero(to_numpy(mask))

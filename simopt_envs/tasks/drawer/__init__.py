@@ -12,17 +12,18 @@ from __future__ import annotations
 from typing import Any
 
 from simopt_envs.tasks.drawer.task import DrawerTask
+from simopt_envs.tasks.effects import Effects
 from simopt_envs.tasks.env import TaskEnv
 from simopt_envs.tasks.vector_env import TaskVectorEnv
 
 __all__ = ["DrawerTask", "make_env", "make_vector_env"]
 
 
-def make_env(**kwargs: Any) -> TaskEnv:
-    """The single environment; keywords of :class:`TaskEnv`."""
-    return TaskEnv(DrawerTask(), **kwargs)
+def make_env(effects: Effects = (), **kwargs: Any) -> TaskEnv:
+    """The single environment; physical effects that its model is to have, and keywords of :class:`TaskEnv`."""
+    return TaskEnv(DrawerTask(effects), **kwargs)
 
 
-def make_vector_env(**kwargs: Any) -> TaskVectorEnv:
-    """The native vector environment; keywords of :class:`TaskVectorEnv`."""
-    return TaskVectorEnv(DrawerTask(), **kwargs)
+def make_vector_env(effects: Effects = (), **kwargs: Any) -> TaskVectorEnv:
+    """The native vector environment; physical effects, and keywords of :class:`TaskVectorEnv`."""
+    return TaskVectorEnv(DrawerTask(effects), **kwargs)

@@ -10,10 +10,12 @@ import mujoco
 import numpy as np
 from gymnasium import spaces
 
+from simopt_envs.physics.arrays import namespace
 from simopt_envs.physics.parameters import Array, ParameterSpace
 from simopt_envs.physics.simulation import Simulation
 from simopt_envs.tasks.arm import JOINTS, VelocityArm
 from simopt_envs.tasks.drawer.parameters import drawer_parameters
+from simopt_envs.tasks.effects import Effects, add_effects
 from simopt_envs.tasks.task import Outcome
 
 OPEN = 0.2  # m, a drawer this far out counts as open
@@ -31,6 +33,9 @@ class DrawerTask:
     constant, and a large constant in the reward is what a critic learns last. It counts only with the handle between
     the fingers, as one finger hooked behind the bar opens the drawer too. And the bonus for fingers around the handle
     grows as they close on it.
+
+    Args:
+        effects: what the model has beyond its MJCF, see :func:`~simopt_envs.tasks.effects.add_effects`.
     """
 
     substeps = 15
@@ -45,27 +50,31 @@ class DrawerTask:
     observation_names = (*JOINTS, "handle_x", "handle_y", "handle_z")
     discrepancy_weights = np.array([0.5] * 7 + [1.0] * 3)
 
-    def __init__(self) -> None:
-        self._nominal = self.make_model()
-        model = self._nominal
+    def __init__(self, effects: Effects = ()) -> None:
+        self._spec = _scene()
+        added = add_effects(self._spec, effects)
+        model = self._nominal = self.make_model()
         self.arm = VelocityArm(model, float(model.opt.timestep) * self.substeps)
-        self.parameters: ParameterSpace = drawer_parameters(model)
+        self.parameters: ParameterSpace = ParameterSpace([*drawer_parameters(model), *added])
         lower, upper = model.jnt_range[[model.joint(name).id for name in JOINTS]].T
         reach = 2.0  # m, nothing of the scene lies farther from the robot's base
         low, high = np.concatenate([lower - 0.2, np.full(3, -reach)]), np.concatenate([upper + 0.2, np.full(3, reach)])
         self.observation_space: spaces.Box[Any] = spaces.Box(low, high, dtype=np.float64)
         self.action_space: spaces.Box[Any] = spaces.Box(-1.0, 1.0, (8,), np.float32)
         self._gripper = model.actuator("gripper").id
-        self._gripper_range = model.actuator("gripper").ctrlrange
+        self._gripper_range = model.actuator("gripper").ctrlrange.tolist()
         self._drawer = model.joint("drawer").qposadr[0]
         self._grasp, self._handle = model.site("grasp").id, model.site("handle").id
         self._fingers = [model.joint(name).qposadr[0] for name in ("finger_left", "finger_right")]
-        self._bar_radius, self._bar_half_length = model.geom("handle").size[:2]
+        self._bar_radius, self._bar_half_length = model.geom("handle").size[:2].tolist()
+
+    def make_spec(self) -> mujoco.MjSpec:
+        """See :meth:`Task.make_spec`."""
+        return self._spec.copy()
 
     def make_model(self, visual: bool = True) -> mujoco.MjModel:
         """See :meth:`Task.make_model`."""
-        with as_file(files("simopt_envs.tasks.drawer")) as folder:
-            spec = mujoco.MjSpec.from_file(str(folder / "model.xml"))
+        spec = self.make_spec()
         spec.compiler.discardvisual = not visual
         return spec.compile()
 
@@ -94,42 +103,47 @@ class DrawerTask:
 
     def control(self, simulation: Simulation, action: Array) -> Array:
         """Seven joint velocities, and the gripper: -1 closed, 1 open."""
-        ctrl = np.empty((len(action), self._nominal.nu))
-        ctrl[:, self.arm.ctrl] = self.arm.targets(simulation, action[:, :7])
         low, high = self._gripper_range
-        ctrl[:, self._gripper] = low + (high - low) * (action[:, 7] + 1.0) / 2.0
-        return ctrl
+        gripper = low + (high - low) * (action[:, 7:] + 1.0) / 2.0
+        return namespace(action).concatenate([self.arm.targets(simulation, action[:, :7]), gripper], axis=1)
 
     def observe(self, simulation: Simulation) -> Array:
         """Seven joint positions [rad] and the handle's position [m]."""
-        return np.concatenate([self.arm.positions(simulation), simulation.data("site_xpos")[:, self._handle]], axis=1)
+        positions, handle = self.arm.positions(simulation), simulation.data("site_xpos")[:, self._handle]
+        return namespace(positions).concatenate([positions, handle], axis=1)
 
     def evaluate(self, simulation: Simulation, action: Array) -> Outcome:
         """See :meth:`Task.evaluate`."""
+        xp = namespace(action)
         sites = simulation.data("site_xpos")
         hand = simulation.data("site_xmat")[:, self._grasp].reshape(-1, 3, 3)
         qpos = simulation.data("qpos")
         opening = qpos[:, self._drawer]
         to_handle = sites[:, self._handle] - sites[:, self._grasp]
-        across, sideways, along = np.einsum("nij,ni->jn", hand, to_handle)  # in the hand's frame; fingers close along y
+        across, sideways, along = xp.einsum("nij,ni->jn", hand, to_handle)  # in the hand's frame; fingers close along y
         left, right = (qpos[:, finger] for finger in self._fingers)
         around = (
-            (np.abs(along) < _GRIP_DEPTH)
-            & (np.abs(across) < self._bar_half_length)
+            (xp.abs(along) < _GRIP_DEPTH)
+            & (xp.abs(across) < self._bar_half_length)
             & (sideways < left)
             & (-sideways < right)
         )
         gap = left + right - 2.0 * self._bar_radius
         held = around & (gap < _GRIP_SLACK)
-        grip = around * np.clip(1.0 - gap / _LOOSE, 0.0, 1.0)
+        grip = around * xp.clip(1.0 - gap / _LOOSE, 0.0, 1.0)
         # The fingers are to point into the cabinet (+x) and to close along z, across the horizontal bar.
-        misaligned = (1.0 - hand[:, 0, 2]) + (1.0 - np.abs(hand[:, 2, 1]))
+        misaligned = (1.0 - hand[:, 0, 2]) + (1.0 - xp.abs(hand[:, 2, 1]))
         measures = {
-            "distance": np.linalg.norm(to_handle, axis=1),
+            "distance": xp.linalg.norm(to_handle, axis=1),
             "angle": misaligned,
-            "opening": np.clip(opening, 0.0, PULL) * grip,
+            "opening": xp.clip(opening, 0.0, PULL) * grip,
             "grasp": grip,
-            "action": np.sum(action**2, axis=1),
+            "action": xp.sum(action**2, axis=1),
         }
         terms = {name: self.weights[name] * value for name, value in measures.items()}
-        return Outcome(reward=np.sum(list(terms.values()), axis=0), terms=terms, success=held & (opening >= OPEN))
+        return Outcome(reward=sum(terms.values()), terms=terms, success=held & (opening >= OPEN))
+
+
+def _scene() -> mujoco.MjSpec:
+    with as_file(files("simopt_envs.tasks.drawer")) as folder:
+        return mujoco.MjSpec.from_file(str(folder / "model.xml"))

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from simopt_envs.tasks.effects import Effects
 from simopt_envs.tasks.env import TaskEnv
 from simopt_envs.tasks.swingpeg.task import SwingPegTask
 from simopt_envs.tasks.vector_env import TaskVectorEnv
@@ -21,11 +22,11 @@ from simopt_envs.tasks.vector_env import TaskVectorEnv
 __all__ = ["SwingPegTask", "make_env", "make_vector_env"]
 
 
-def make_env(**kwargs: Any) -> TaskEnv:
-    """The single environment; keywords of :class:`TaskEnv`."""
-    return TaskEnv(SwingPegTask(), **kwargs)
+def make_env(effects: Effects = (), **kwargs: Any) -> TaskEnv:
+    """The single environment; physical effects that its model is to have, and keywords of :class:`TaskEnv`."""
+    return TaskEnv(SwingPegTask(effects), **kwargs)
 
 
-def make_vector_env(**kwargs: Any) -> TaskVectorEnv:
-    """The native vector environment; keywords of :class:`TaskVectorEnv`."""
-    return TaskVectorEnv(SwingPegTask(), **kwargs)
+def make_vector_env(effects: Effects = (), **kwargs: Any) -> TaskVectorEnv:
+    """The native vector environment; physical effects, and keywords of :class:`TaskVectorEnv`."""
+    return TaskVectorEnv(SwingPegTask(effects), **kwargs)

@@ -41,7 +41,11 @@ class Dimensions:
 
 def make_model(dimensions: Dimensions = Dimensions(), visual: bool = True) -> mujoco.MjModel:
     """Compile the scene; without ``visual`` it lacks what is there only to be seen."""
-    spec = make_spec(dimensions)
+    return compile_spec(make_spec(dimensions), visual)
+
+
+def compile_spec(spec: mujoco.MjSpec, visual: bool = True) -> mujoco.MjModel:
+    """Compile a spec of the scene; without ``visual`` it lacks what is there only to be seen."""
     spec.compiler.discardvisual = not visual
     model = spec.compile()
     model.geom_rbound *= LENGTH_FACTOR  # bounding spheres of the broad phase: large enough for every ξ
