@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
+import simopt_envs  # noqa: F401 - registers the environments
 from simopt_envs.measured import LogMapping, Source, load_recording, load_recordings, replay
 from wrappers.record import RecordEpisodes
 
@@ -152,6 +153,38 @@ def test_a_registered_env_keeps_its_behaviour_and_its_spec_rebuilds_the_wrapper(
     assert list(recording.columns) == ["action/0", "observation/0", "observation/1", "observation/2"]
     assert len(recording) == 201
     assert isinstance(gym.make(recorded.spec), RecordEpisodes)
+
+
+def test_a_log_that_is_faster_than_the_policy_and_noisy(tmp_path):
+    noise = {"qpos/joint*": 0.01, "site/handle/*": 0.1}
+    columns = ["qpos/joint*", "site/handle/*"]
+    robot = RecordEpisodes(gym.make("SimOpt/Drawer-v0"), tmp_path / "a", columns=columns, noise=noise, per_step=5)
+    exact = RecordEpisodes(gym.make("SimOpt/Drawer-v0"), tmp_path / "b")
+    plain = gym.make("SimOpt/Drawer-v0")
+    for env in (robot, exact, plain):
+        env.reset(seed=4)
+    for action in np.random.default_rng(0).uniform(-1, 1, (50, 8)).astype(np.float32):
+        expected = plain.step(action)[0]
+        np.testing.assert_array_equal(robot.step(action)[0], expected)
+        exact.step(action)
+    fast, slow = (load_recording(env.recordings[0]) for env in (robot, exact))
+    assert (len(fast), len(slow)) == (251, 51)
+    assert set(fast.signals) == {*(f"qpos/joint{i}" for i in range(1, 8)), *(f"site/handle/{axis}" for axis in "xyz")}
+    np.testing.assert_allclose(fast.time[::5], slow.time, atol=1e-9)
+    np.testing.assert_array_equal(fast["ctrl/joint3"][:-1:5], slow["ctrl/joint3"][:-1])
+    np.testing.assert_array_equal(fast["ctrl/joint3"][4:-1:5], slow["ctrl/joint3"][:-1])
+    for column, std in (("qpos/joint3", 0.01), ("site/handle/y", 0.1)):
+        error = fast[column][::5] - slow[column]
+        assert 0.6 * std < error.std() < 1.4 * std
+    assert np.abs(np.diff(slow["qpos/joint4"])).max() > 0.01
+
+    for wrong, message in ((7, "must divide the 15 timesteps"), (0, "must divide")):
+        with pytest.raises(ValueError, match=message):
+            RecordEpisodes(gym.make("SimOpt/Drawer-v0"), tmp_path / "c", per_step=wrong)
+    with pytest.raises(ValueError, match="only environments of this package"):
+        RecordEpisodes(Arm(), tmp_path / "c", per_step=2)
+    with pytest.raises(ValueError, match="unknown column 'qpos/elbow'"):
+        RecordEpisodes(Arm(), tmp_path / "c", columns=["qpos/elbow"])
 
 
 def test_minari(tmp_path, monkeypatch):

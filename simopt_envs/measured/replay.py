@@ -120,7 +120,7 @@ def replay(
     windows = cut_windows(model, recordings, seconds, step, keyframe)
     simulator = WindowSimulator(model, windows, space)
     simulated = simulator(xi)
-    first_xi = None if xi is None else np.atleast_2d(np.asarray(xi))[:1]
+    first_xi = None if xi is None else np.atleast_2d(np.asarray(xi, dtype=np.float64))[:1]
     spread = np.sqrt(np.sum(start_sensitivity(model, simulator, first_xi, simulated[0]) ** 2, axis=0))
     warnings = tuple(dict.fromkeys(w for recording in recordings for w in recording.warnings))
     return Replay(windows, simulated, spread, warnings + tuple(_unseen(model, windows.starts)))
@@ -140,7 +140,7 @@ class Simulator(Protocol):
 
 
 def start_sensitivity(
-    model: mujoco.MjModel, simulator: Simulator, xi: ArrayLike | None = None, nominal: Array | None = None
+    model: mujoco.MjModel, simulator: Simulator, xi: Array | None = None, nominal: Array | None = None
 ) -> Array:
     """How the predictions move when one number of the start moves by its standard error.
 
