@@ -6,6 +6,7 @@ import pytest
 needs_batch = pytest.mark.skipif(
     tuple(map(int, mujoco.__version__.split(".")[:2])) < (3, 17), reason="mujoco.batch needs mujoco >= 3.17"
 )
+needs_effects = pytest.mark.skipif(int(mujoco.__version__.split(".")[0]) < 4, reason="effects need mujoco >= 4.0")
 
 
 def _compiles(xml: str) -> bool:

@@ -3,12 +3,13 @@
 import mujoco
 import numpy as np
 import pytest
-from mujoco.batch import Batch
 
 from simopt_envs.physics import ModelWriter, Parameter, ParameterSpace, Write
 from simopt_envs.physics.columns import acts_on_columns
 from simopt_envs.physics.effects import EFFECTS, Motion
 from simopt_envs.physics.effects.actuators import command_sources, on_all_parts
+
+Batch = pytest.importorskip("mujoco.batch", reason="effects need MuJoCo >= 3.17").Batch
 
 XML = """
 <mujoco>

@@ -7,11 +7,12 @@ from collections.abc import Callable, Mapping
 import mujoco
 import numpy as np
 import pytest
-from mujoco.batch import Batch
 
 from simopt_envs.physics import ModelWriter, ParameterSpace
 from simopt_envs.physics.effects import EFFECTS, Motion
 from simopt_envs.physics.spec_writer import write_spec
+
+Batch = pytest.importorskip("mujoco.batch", reason="effects need MuJoCo >= 3.17").Batch
 
 # The classes' defaults are a trap: nothing that an effect adds may inherit them.
 ARM = """

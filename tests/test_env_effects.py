@@ -3,10 +3,13 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from conftest import needs_batch
+from conftest import needs_batch, needs_effects
 
 import simopt_envs  # noqa: F401 - registers the environments
 from simopt_envs.physics.effects import EFFECTS
+
+pytestmark = needs_effects
+
 
 DRAWER, SWING_PEG = "SimOpt/Drawer-v0", "SimOpt/SwingPeg-v0"
 ARM = [

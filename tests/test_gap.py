@@ -8,13 +8,15 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
+from conftest import needs_effects
 from gap_plant import MODEL, record
 
 from simopt_envs.gap import find_gap
 from simopt_envs.measured import cut_windows, simulate_windows
 from simopt_envs.physics.effects import EFFECTS
 
-pytest.importorskip("mujoco.batch")
+pytestmark = needs_effects
+
 
 FEW = [
     EFFECTS[name]

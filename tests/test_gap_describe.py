@@ -5,6 +5,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
+from conftest import needs_effects
 
 from simopt_envs.gap.describe import Carrier, Residual, Variable, describe, describe_errors
 from simopt_envs.gap.fit import Misfit
@@ -13,6 +14,9 @@ from simopt_envs.gap.motion import motion_of
 from simopt_envs.gap.plain import plain_parameters
 from simopt_envs.measured import cut_windows
 from simopt_envs.measured.recording import Recording
+
+pytestmark = needs_effects
+
 
 WINDOWS, SAMPLES, RECORDINGS = 40, 20, 5
 SUBSTEPS = 10

@@ -3,11 +3,15 @@
 import mujoco
 import numpy as np
 import pytest
+from conftest import needs_effects
 
 from simopt_envs.gap.circumstances import Circumstances, circumstances
 from simopt_envs.gap.localise import EVERYWHERE, Partition, localise, partitions, tabulate
 from simopt_envs.measured import cut_windows
 from simopt_envs.measured.recording import Recording
+
+pytestmark = needs_effects
+
 
 CHANNELS = ("qpos/a", "qpos/b", "qpos/c")
 SLIDER = """

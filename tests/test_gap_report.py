@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from conftest import needs_effects
 
 from simopt_envs.gap.describe import Curve
 from simopt_envs.gap.figures import candidates_figure, curve_figure, error_figure, overlay_figure, regime_figure
@@ -14,6 +15,9 @@ from simopt_envs.measured.states import States
 from simopt_envs.measured.windows import Windows
 from simopt_envs.report.figures import save_figure
 from simopt_envs.report.page import write_page
+
+pytestmark = needs_effects
+
 
 RNG = np.random.default_rng(0)
 WINDOWS, SAMPLES = 6, 20

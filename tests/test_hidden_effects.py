@@ -5,6 +5,7 @@ import sys
 import mujoco
 import numpy as np
 import pytest
+from conftest import needs_effects
 
 from benchmarks.hidden_effects import laws
 from benchmarks.hidden_effects.cases import FIRST_SEED, LEVELS, Case, Hidden, cases, table
@@ -15,6 +16,9 @@ from benchmarks.hidden_effects.outside import OUTSIDE
 from benchmarks.hidden_effects.plants import RECORDINGS, nominal_model, plants
 from benchmarks.hidden_effects.score import Answer, Rate, confusion, magnitude_errors, rates
 from benchmarks.hidden_effects.truth import HALF_STEP_LEAD, TIMESTEP, World, delayed
+
+pytestmark = needs_effects
+
 
 FRICTION = Hidden("coulomb_friction", "joint:elbow", 0.05, False, 10.0, False)
 

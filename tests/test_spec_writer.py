@@ -10,6 +10,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+from conftest import needs_effects
 
 import simopt_envs  # noqa: F401 - registers the environments
 from simopt_envs.physics import ModelWriter, Parameter, ParameterSpace, Write
@@ -17,6 +18,9 @@ from simopt_envs.physics.columns import acts_on_columns
 from simopt_envs.physics.effects import EFFECTS, Motion
 from simopt_envs.physics.spec_writer import write_spec
 from simopt_envs.physics.writer import field_elements, model_field
+
+pytestmark = needs_effects
+
 
 XML = """
 <mujoco>

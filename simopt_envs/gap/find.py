@@ -23,7 +23,7 @@ from simopt_envs.measured.mapping import LogMapping
 from simopt_envs.measured.readers import load_recordings
 from simopt_envs.measured.recording import Recording
 from simopt_envs.measured.windows import Windows
-from simopt_envs.physics.effects import EFFECTS, Effect
+from simopt_envs.physics.effects import EFFECTS, Effect, require_mujoco
 
 _SEED = 0  # of the bootstrap
 
@@ -52,8 +52,10 @@ def find_gap(
 
     Raises:
         FileNotFoundError: for a file that does not exist.
+        ImportError: where MuJoCo is older than 4.0.
         ValueError: for a model that does not compile, recordings that do not fit it, or audits that found errors.
     """
+    require_mujoco()
     began = time.perf_counter()
     given = _spec(model)
     start = plain_parameters(given) if plain is None else Plain.of(given, plain)

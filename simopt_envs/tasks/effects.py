@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
-from simopt_envs.physics.effects import EFFECTS, Effect, object_name
+from simopt_envs.physics.effects import EFFECTS, Effect, object_name, require_mujoco
 from simopt_envs.physics.effects.actuator_delay import LONGEST
 from simopt_envs.physics.parameters import Parameter, Write, unknown_name
 
@@ -55,6 +55,7 @@ def with_effects(env_id: str, effects: Effects) -> EnvSpec:
 
 def _read(spec: mujoco.MjSpec, entry: Mapping[str, Any]) -> tuple[Effect, str, dict[str, float]]:
     """An entry as effect, place and values."""
+    require_mujoco()
     for key in _KEYS:
         if key not in entry:
             raise ValueError(f"an effect needs the keys {', '.join(_KEYS)}; got {dict(entry)}")
