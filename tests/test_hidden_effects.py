@@ -25,7 +25,8 @@ FRICTION = Hidden("coulomb_friction", "joint:elbow", 0.05, False, 10.0, False)
 
 def test_nothing_of_the_library_is_imported():
     modules = "generate, score, detectability, outside"
-    code = f"import sys; from benchmarks.hidden_effects import {modules}; print(*sys.modules)"
+    code = f"import sys; before = {{*sys.modules}}; from benchmarks.hidden_effects import {modules}"
+    code += "; print(*({*sys.modules} - before))"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
     assert "benchmarks.hidden_effects.truth" in loaded
     assert not {name.split(".")[0] for name in loaded} & {"simopt_envs", "wrappers", "baselines", "gymnasium"}

@@ -44,4 +44,4 @@ class ActuatorSaturation(Effect):
     def probes(self, model: mujoco.MjModel, place: str, motion: Motion) -> tuple[dict[str, float], ...]:
         """Limits below the greatest force, which is one to three times the root mean square."""
         force = drive_force(model, object_name(place), motion)
-        return tuple({"limit": part * force} for part in (3.0, 2.0, 1.4, 1.0, 0.7))
+        return tuple({"limit": part * force} for part in (0.7, 1.0, 1.4, 2.0, 3.0))
