@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from baselines.commands import inputs
+from baselines.commands.gap_demo import GapDemo
 from baselines.commands.progress import Display
 from baselines.commands.runs import control_period, run_loop
 from simopt_envs.adaptation import EnvSimulator, HiddenSystem, SimOpt
@@ -41,8 +42,8 @@ class Demo:
     Run again, it goes on where it was, or shows what is there.
     """
 
-    task: Literal["drawer", "swing-peg"] = "drawer"
-    """The task."""
+    task: Literal["drawer", "swing-peg", "gap"] = "drawer"
+    """The task; gap: a drawer whose robot has an effect that no ξ holds, and that the gap workflow must name first."""
     out: Path | None = None
     """Folder for result.json, checkpoints, plots, film and report.html; out/demo-TASK by default."""
     seed: int = 0
@@ -51,6 +52,9 @@ class Demo:
     def run(self, typed: str) -> None:
         """Train, adapt and report; ``typed`` is the command line."""
         out = self.out or Path(f"out/demo-{self.task}")
+        if self.task == "gap":
+            GapDemo(out, self.seed, typed).run()
+            return
         inputs.require_free(out, resume=True)
         env_id, hidden = TASKS[self.task]
         simulator, display = EnvSimulator(env_id), Display()
