@@ -1,6 +1,6 @@
 """Run the gap workflow on cases, which is given their folder and nothing else.
 
-    python -m benchmarks.hidden_effects.run --cases DIR --out RESULTS [--count 20] [--report]
+    python -m benchmarks.hidden_effects.run --cases DIR --out RESULTS [--count 20]
 
 Cases that have a result are kept, so that a run that was stopped goes on. A case that fails is told and skipped.
 """
@@ -21,7 +21,6 @@ def main() -> None:
     parser.add_argument("--cases", type=Path, required=True, help="folder of cases, without their labels")
     parser.add_argument("--out", type=Path, required=True, help="folder for a gap.json of each case")
     parser.add_argument("--count", type=int, default=None, help="the first so many cases by name")
-    parser.add_argument("--report", action="store_true", help="write the report of each case as well")
     arguments = parser.parse_args()
     cases = sorted(path for path in arguments.cases.iterdir() if (path / "model.xml").exists())[: arguments.count]
     if not cases:
@@ -36,8 +35,6 @@ def main() -> None:
         except (ValueError, RuntimeError) as error:
             print(f"{i + 1}/{len(cases)} {case.name}: FAILED: {error}", flush=True)
             continue
-        if arguments.report:
-            gap.save(target.parent)
         target.parent.mkdir(parents=True, exist_ok=True)
         partial = target.with_suffix(".part")
         partial.write_text(json.dumps(gap.to_dict(), indent=1) + "\n")

@@ -89,11 +89,6 @@ class Misfit:
         self._measured = windows.measured
         self._counted = np.isfinite(windows.measured)
 
-    @property
-    def samples(self) -> int:
-        """How many numbers were measured."""
-        return int(self._counted.sum())
-
     def with_noise(self, noise: Noise) -> Misfit:
         """The same with another noise, and the worlds that are there."""
         other = object.__new__(Misfit)

@@ -309,8 +309,9 @@ class Search:
         for effect in effects if len(effects) > 1 else ():
             others = [e for e in effects if e != effect]
             without = self.base(others, base.hypothesis.without(effect, base.fit.u))
-            with_it = self.trial(without, self.screen(without, effect))
-            if not _score(without, self.screen(without, effect), with_it, _worth(with_it)).earned:
+            screened = self.screen(without, effect)
+            with_it = self.trial(without, screened)
+            if not _score(without, screened, with_it, _worth(with_it)).earned:
                 return self._eliminated(without)
         return base
 
