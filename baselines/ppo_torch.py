@@ -91,10 +91,8 @@ class PPOConfig:
     initial_log_std: float = -0.3
     """Logarithm of the exploration noise at the start, where the action range is ±1."""
     stuck_iterations: int = 15
-    """A training that continues from a given policy keeps its exploration noise, as more of it may ruin what the
-    policy can do. If no episode of the first so many iterations succeeds, there is nothing to ruin."""
-    stuck_log_std: float = -0.3
-    """Exploration noise is then raised to at least this."""
+    """A training that continues from a given policy starts from scratch if no episode of the first so many iterations
+    succeeds: with its little exploration noise it will not find out how, and new weights do in a minute."""
     success_stop: float | None = 0.97
     """Training ends early at this success rate (mean of `info["is_success"]` at episode ends, where the env has it)."""
     evaluation_share: float = 0.125
@@ -543,8 +541,6 @@ class TorchPPO:
                 kl = update(policy, optimizer, prepare(policy, rollout, config), config, generator)
                 for group in optimizer.param_groups:
                     group["lr"] = adapted_learning_rate(group["lr"], kl, config)
-                if warm and iteration == config.stuck_iterations and collector.best_success == 0.0:
-                    policy.log_std.data.clamp_(min=config.stuck_log_std)
                 policy.optimizer_state = optimizer.state_dict()
             if self.checkpoint is not None:
                 self.save(policy, self.checkpoint)
@@ -562,6 +558,10 @@ class TorchPPO:
                 )
             if solved:
                 break
+            if warm and iteration == config.stuck_iterations and collector.best_success == 0.0:
+                afresh = self._train(env, None, rng)
+                afresh.steps_trained += policy.steps_trained
+                return afresh
         return policy.cpu()
 
     def save(self, policy: TorchPolicy, path: Path) -> None:

@@ -190,19 +190,15 @@ class Unsolvable(Aim):
         return *super().step(action)[:4], {"is_success": False}
 
 
-@pytest.mark.parametrize(("env_class", "raised"), [(Unsolvable, True), (Aim, False)])
-def test_exploration_is_raised_only_where_a_given_policy_never_succeeds(env_class, raised):
-    policy = train()
-    assert policy.log_std.max() < -1.0
-    config = replace(SMALL, warm_start_iterations=3, stuck_iterations=3, stuck_log_std=-0.2)
-    assert (train(config, policy=policy, env_class=env_class).log_std.min() >= -0.2) == raised
-    before = train(replace(config, warm_start_iterations=2), policy=policy, env_class=env_class)
-    assert before.log_std.max() < -1.0
-
-
-def test_a_training_from_scratch_keeps_the_exploration_it_learns():
-    config = replace(SMALL, iterations=2, stuck_iterations=2, stuck_log_std=1.0)
-    assert train(config, env_class=Unsolvable).log_std.max() < 0.0
+@pytest.mark.parametrize(("env_class", "iterations"), [(Unsolvable, [1, 2, 1, 2, 3, 4]), (Aim, [1, 2, 3])])
+def test_a_given_policy_that_never_succeeds_gives_way_to_a_new_one(env_class, iterations):
+    config = replace(SMALL, iterations=4, warm_start_iterations=3, stuck_iterations=2)
+    policy, seen = train(), []
+    further = train(config, policy=policy, env_class=env_class, on_progress=seen.append)
+    assert [progress.steps for progress in seen] == [i * 16 * 20 for i in iterations]
+    assert further.steps_trained == policy.steps_trained + len(iterations) * 16 * 20
+    starts_anew = further.observation_normaliser.count < policy.observation_normaliser.count
+    assert starts_anew == (env_class is Unsolvable)
 
 
 def test_interrupt_leaves_the_checkpoint_of_the_last_iteration(tmp_path):

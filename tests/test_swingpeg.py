@@ -43,7 +43,7 @@ def compiled_with_box(scale):
     return spec.compile()
 
 
-GEOMETRY = {
+COMPILED = {
     "rope_width": (1.5, lambda d: make_model(replace(d, rope_width=1.5 * d.rope_width))),
     "rope_segment_length": (0.7, lambda d: make_model(replace(d, rope_segment_length=0.7 * d.rope_segment_length))),
     "rope_density": (3.0, lambda d: make_model(replace(d, rope_density=3.0 * d.rope_density))),
@@ -56,15 +56,23 @@ GEOMETRY = {
     "box_scale": (1.4, lambda d: compiled_with_box(1.4)),
     "peg_friction": (3.0, lambda d: make_model(replace(d, peg_friction=3.0 * d.peg_friction))),
     "rope_friction": (3.0, lambda d: make_model(replace(d, rope_friction=3.0 * d.rope_friction))),
+    **{
+        f"rope_{bend}_{kind}": (
+            2.0,
+            lambda d, name=f"rope_{bend}_{kind}": make_model(replace(d, **{name: 2.0 * getattr(d, name)})),
+        )
+        for bend in ("torsion", "bending")
+        for kind in ("stiffness", "damping")
+    },
     "box_friction": (3.0, lambda d: make_model(replace(d, box_friction=3.0 * d.box_friction))),
 }
 # Spheres are made larger on purpose (dof_length, for sleeping alone, follows them); pairs do not use the boxes.
 _BOUNDING = {"geom_rbound", "dof_length", "geom_aabb", "bvh_aabb"}
 
 
-@pytest.mark.parametrize("name", GEOMETRY)
+@pytest.mark.parametrize("name", COMPILED)
 def test_writing_a_parameter_equals_compiling_with_it(name):
-    factor, compile_with = GEOMETRY[name]
+    factor, compile_with = COMPILED[name]
     model, reference, nominal = (
         written({name: factor * SwingPegTask().parameters[name].nominal}),
         compile_with(NOMINAL),

@@ -52,7 +52,7 @@ def swingpeg_parameters(model: mujoco.MjModel) -> ParameterSpace:
                 "rope_bending_damping",
                 "N m s/rad",
                 d.rope_bending_damping,
-                tuple(Write("dof_damping", joint, (0,)) for joint in BENDING_JOINTS),
+                tuple(Write("dof_damping", joint) for joint in BENDING_JOINTS),
                 "bending damping of each of the rope's joints",
                 factor=_ROPE_FACTOR,
             ),
