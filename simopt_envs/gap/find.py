@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -77,13 +78,16 @@ def _gap(given: mujoco.MjSpec, explanation: Explanation, data: Data, seconds: fl
     as_given = null.hypothesis.space.nominal
     fitted = [base.hypothesis.xi(base.fit.u[None])[0] for base in (null, final)]
     models = [(null.hypothesis, as_given), (null.hypothesis, fitted[0]), (final.hypothesis, fitted[1])]
-    errors = held_out_errors(data.held_out, models, null.noise.scale, np.random.default_rng(_SEED))
+    errors = held_out_errors(data.held_out, models, null.sensor_noise, np.random.default_rng(_SEED))
     explained = Explanation(null, final, explanation.stages)
     spec, diff = repair(explained, given, fitted[1])
     rows = localise(data.held_out, null.held_out, null.hypothesis.plain.model)
     residuals = [
-        Residual(data.fitted, final.fit.errors, final.noise),
-        Residual(data.held_out, final.held_out, final.held_out_noise),
+        Residual(windows, errors, replace(noise, scale=final.sensor_noise))
+        for windows, errors, noise in (
+            (data.fitted, final.tolerance * final.fit.errors, final.noise),
+            (data.held_out, final.held_out, final.held_out_noise),
+        )
     ]
     left = describe(final.hypothesis, final.fit.u, residuals)
     return Gap(verdict, named_effects(explained), errors, rows, left, explanation, data, spec, diff, seconds)

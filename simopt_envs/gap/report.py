@@ -117,7 +117,7 @@ def error(gap: Gap, plots: _Plots) -> Iterator[Section]:
     yield plots.section(
         "Simulation against measurement",
         "overlays",
-        overlay_figure(gap.data.held_out, errors.simulated[:stages], gap.explanation.null.noise.scale),
+        overlay_figure(gap.data.held_out, errors.simulated[:stages], gap.explanation.null.sensor_noise),
         "Around the worst window of each channel, on recordings that no fit saw. Every window starts from the state "
         "estimated there, where the lines jump.",
     )

@@ -179,7 +179,8 @@ def named_effects(explanation: Explanation) -> tuple[Named, ...]:
     """The effects that a search found, with what it knows of their numbers."""
     final = explanation.final
     hypothesis, u = final.hypothesis, final.fit.u
-    spread = np.sqrt(np.diag(final.fit.covariance()) * max(1.0, 1.0 + final.excess))
+    mean_square = float(np.mean((final.held_out / final.tolerance) ** 2))
+    spread = np.sqrt(np.diag(final.fit.covariance()) * max(1.0, mean_square))
     ends = u + _NORMAL_95 * np.array([-spread, spread])
     xi, (low, high) = hypothesis.xi(u[None])[0], hypothesis.xi(ends)
     scores = {score.candidate: score for stage in explanation.stages for score in stage.scores}

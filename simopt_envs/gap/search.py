@@ -11,7 +11,7 @@ from simopt_envs.adaptation.fitting import Noise
 from simopt_envs.gap.fit import Fit, Misfit, fit
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
 from simopt_envs.gap.plain import SPEAKS_FOR, Plain
-from simopt_envs.gap.thresholds import EVIDENCE, EXPLAINED, FAR, FURTHER, MOST_EFFECTS, REFITTED, SIMPLER
+from simopt_envs.gap.thresholds import EVIDENCE, EXPLAINED, FAR, FURTHER, MOST_EFFECTS, REFITTED, SIMPLER, SIMPLER_SHARE
 from simopt_envs.measured.recording import Finding, Recording
 from simopt_envs.measured.windows import Windows
 from simopt_envs.physics.effects import Motion
@@ -25,6 +25,7 @@ _STEPS = np.array([1.0, 0.3, 0.1, 0.03])  # shares of the screen's step that a f
 _WORTH_A_START = 0.2  # share of the best probe's gain at which a fit may start from another one
 _SIZES = np.array([-30.0, -10.0, -3.0, -1.0, 1.0, 3.0, 10.0, 30.0])  # probes, of an effect that is spoken for
 _FURTHEST = 20.0  # probes that the screen's step may be long
+_COARSE = 3.0  # times the sensors' noise, from which what a model leaves decides what a fit counts errors in
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ class Trial:
     Attributes:
         hypothesis: plain parameters and effects.
         fit: of the fitted windows.
-        held_out: whitened errors there, (w, S, c).
+        held_out: whitened errors there, in units of the sensors' noise, (w, S, c).
     """
 
     hypothesis: Hypothesis
@@ -66,14 +67,22 @@ class Trial:
 
 @dataclass(frozen=True)
 class Base(Trial):
-    """A trial that others are compared with, and the noise they are all counted in.
+    """A trial that others are compared with, and the noise they are all fitted in.
 
     Attributes:
         noise, held_out_noise: at its ξ.
+        tolerance: how many times the sensors' noise that noise is, (c,): what even the best model leaves, where it
+            leaves more. Fits in units of less would count priors for nothing.
     """
 
     noise: Noise
     held_out_noise: Noise
+    tolerance: Array
+
+    @property
+    def sensor_noise(self) -> Array:
+        """Standard deviation of each channel's noise, (c,)."""
+        return self.noise.scale / self.tolerance
 
 
 @dataclass(frozen=True)
@@ -195,17 +204,23 @@ class Search:
         self.plain, self.data, self.motion, self.candidates = plain, data, motion, tuple(candidates)
         self._progress = progress
         self._floor: Array | None = None
+        self._tolerance = np.ones(len(data.fitted.channels))
 
     def run(self) -> Explanation:
         """Add effects while they earn it, then take away those that the others have made needless."""
         null = base = self.base()
-        stages = []
-        while len(base.hypothesis.candidates) < MOST_EFFECTS:
-            stages.append(self.stage(base))
-            best = _chosen(null, base, stages[-1].scores)
-            if best is None:
-                break
+        stages = [self.stage(null)]
+        left = _left_by(min((score.trial for score in stages[0].scores), key=lambda trial: trial.excess))
+        if np.any(left > _COARSE):  # only now it is known that nothing comes near the sensors' noise
+            self._tolerance = left
+            null = base = self.base()
+            stages = [self.stage(null)]
+        while (best := _chosen(null, base, stages[-1].scores)) is not None:
+            self._tolerance = _left_by(best.trial)
             base = self.base([*base.hypothesis.candidates, best.candidate], best.trial.fit.u)
+            if len(base.hypothesis.candidates) == MOST_EFFECTS:
+                break
+            stages.append(self.stage(base))
         return Explanation(null, self._eliminated(base), tuple(stages))
 
     def base(self, effects: Sequence[Candidate] = (), start: Array | None = None) -> Base:
@@ -219,11 +234,11 @@ class Search:
             u = fit(fitted.with_noise(fitted.noise_at(u, floor)), u, _ITERATIONS).u
             self._floor = np.minimum(floor, fitted.noise_floor(u))
         self._progress("fit", 1, 2)
-        floor = self._floor
+        floor = self._floor * self._tolerance
         noise, held_out_noise = fitted.noise_at(u, floor), held_out.noise_at(u, floor)
         found = fit(fitted.with_noise(noise), u, _ITERATIONS)
-        errors = held_out.with_noise(held_out_noise).errors(found.u[None])[0]
-        return Base(hypothesis, found, errors, noise, held_out_noise)
+        errors = self._tolerance * held_out.with_noise(held_out_noise).errors(found.u[None])[0]
+        return Base(hypothesis, found, errors, noise, held_out_noise, self._tolerance)
 
     def stage(self, base: Base) -> Stage:
         """Screen all candidates, and fit the best."""
@@ -239,7 +254,7 @@ class Search:
         for done, one in enumerate(promising):
             self._progress("refit", done, len(promising))
             trials.append(self.trial(base, one, one.candidate in spoken_for))
-        best = min(trials, key=lambda trial: trial.fit.loss + 0.5 * np.sum(trial.held_out**2))
+        best = min(trials, key=lambda trial: trial.fit.loss + 0.5 * np.sum((trial.held_out / base.tolerance) ** 2))
         worth = _worth(best)
         scores = [_score(base, s, t, worth) for s, t in zip(promising, trials, strict=True)]
         return Stage(base, tuple(screened), tuple(sorted(scores, key=lambda score: -score.total)))
@@ -291,7 +306,7 @@ class Search:
             other = fit(misfit, misfit.best(tried), _ITERATIONS)
             found = min(found, other, key=lambda f: f.loss)
         held_out = Misfit(hypothesis, self.data.held_out).with_noise(base.held_out_noise)
-        return Trial(hypothesis, found, held_out.errors(found.u[None])[0])
+        return Trial(hypothesis, found, base.tolerance * held_out.errors(found.u[None])[0])
 
     def _spoken_for(self, base: Base) -> list[Candidate]:
         """The candidates that plain parameters far outside their priors speak for; a linear screen cannot tell them."""
@@ -328,17 +343,31 @@ def _clipped(step: float, shift: Array, neutral: Array, hypothesis: Hypothesis, 
 def _chosen(null: Base, base: Base, scores: Sequence[Score]) -> Score | None:
     """The candidate to add: the simplest of those that the best does not beat both in the fit and on held-out data.
 
-    Where the base is right already, to what noise is, a further effect must explain a share of what the ones before it
-    did: a law of slightly another form than the true one leaves that much.
+    A law of slightly another form than the true one leaves an error that nothing in the library describes, but much of
+    it bends a little. So a further effect must make the model right, to what noise is, or explain a share of what the
+    ones before it did. Where even the best leaves more than noise, a simpler one that takes nearly as much is as good.
     """
     earned = [score for score in scores if score.earned]
-    if base.excess < EXPLAINED - 1 and base is not null:
-        least = FURTHER * (null.excess - base.excess)
-        earned = [s for s in earned if base.excess - s.trial.excess > least or s.of_prior > 0.5 * FAR**2]
+    if base is not null:
+        right, least = EXPLAINED - 1, FURTHER * (null.excess - base.excess)
+        earned = [
+            s
+            for s in earned
+            if base.excess > right > s.trial.excess
+            or base.excess - s.trial.excess > least
+            or s.of_prior > 0.5 * FAR**2
+        ]
     if not earned:
         return None
     best = earned[0]
-    as_good = [s for s in earned if best.fitted - s.fitted < SIMPLER or best.held_out - s.held_out < SIMPLER]
+    enough = base.excess - SIMPLER_SHARE * (base.excess - best.trial.excess)
+    as_good = [
+        s
+        for s in earned
+        if best.fitted - s.fitted < SIMPLER
+        or best.held_out - s.held_out < SIMPLER
+        or enough > s.trial.excess > best.trial.excess > EXPLAINED - 1
+    ]
     return min(as_good, key=lambda score: (len(score.trial.fit.u), -score.total))
 
 
@@ -354,6 +383,11 @@ def _worth(best: Trial) -> Array:
     return 1 / np.maximum(mean_square * np.where(mean_square > EXPLAINED, alike, 1.0), 1.0)
 
 
+def _left_by(best: Trial) -> Array:
+    """The errors that a model leaves, in units of the sensors' noise, (c,), each counted by what it is worth."""
+    return 1 / np.sqrt(_worth(best))
+
+
 def _score(base: Base, screened: Screened, trial: Trial, worth: Array) -> Score:
     """Gains in nats, each squared error counted by what it is worth."""
 
@@ -366,6 +400,6 @@ def _score(base: Base, screened: Screened, trial: Trial, worth: Array) -> Score:
     added = len(trial.fit.u) - len(base.fit.u)
     price = 0.5 * added * np.log(base.fit.errors.size)
     of_prior = prior(base.fit) - prior(trial.fit)
-    fitted = gain(base.fit.errors, trial.fit.errors) + of_prior - price
+    fitted = gain(base.tolerance * base.fit.errors, base.tolerance * trial.fit.errors) + of_prior - price
     held_out = gain(base.held_out, trial.held_out) + of_prior
     return Score(screened, trial, float(fitted), float(held_out), of_prior)

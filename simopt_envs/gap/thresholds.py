@@ -12,8 +12,12 @@ EXPLAINED = 1.25
 SIMPLER = 5.0
 """Nats by which a candidate with more parameters must win, both fitted and held out, over one with fewer."""
 
+SIMPLER_SHARE = 0.8
+"""Share of what the best takes from the held-out excess at which a candidate with fewer parameters is as good, where
+even the best leaves more than noise."""
+
 FURTHER = 0.02
-"""Share of the held-out excess removed so far that a further effect must add, once the model counts as right."""
+"""Share of the held-out excess removed so far that a further effect must add, unless it makes the model right."""
 
 LEAST_SHARE = 0.35
 """Share of the held-out excess that the effects must take away, or the gap is unexplained."""

@@ -48,7 +48,9 @@ class SwingPegTask:
         "action": -0.1,
     }
     observation_names = (*JOINTS, "peg_x", "peg_y", "peg_z")
-    discrepancy_weights = np.array([0.05] * 7 + [1.0] * 3)  # the paper's
+    # The paper's for its drawer. With the 0.05 that it gives the joints here, half of the seeds lose the rope's length:
+    # where the peg goes alone tells a softer arm badly from a longer rope.
+    discrepancy_weights = np.array([0.5] * 7 + [1.0] * 3)
 
     def __init__(self, effects: Effects = ()) -> None:
         self._spec = make_spec()
