@@ -6,14 +6,20 @@ Simulated rollouts of many ξ, candidate fits, cells of an experiment: each is a
 
 from __future__ import annotations
 
+import os
+import socket
 from collections.abc import Callable, Iterator, Sequence
 from textwrap import shorten
 from typing import Any, Protocol, TypeVar
+from urllib.parse import urlsplit
 
 T = TypeVar("T")
 R = TypeVar("R")
 OnProgress = Callable[[int, int], None]
 """Called with how many tasks are done, and of how many."""
+OnOutcome = Callable[[int, Any], None]
+"""Called with the index of a task, and what it returned or the exception that it raised."""
+_SECONDS_TO_CONNECT = 5.0
 
 
 class FailedTasksError(RuntimeError):
@@ -42,7 +48,13 @@ class Engine(Protocol):
 
     num_threads: int
 
-    def map(self, function: Callable[..., R], tasks: Sequence[T], shared: tuple[object, ...] = ()) -> list[R]:
+    def map(
+        self,
+        function: Callable[..., R],
+        tasks: Sequence[T],
+        shared: tuple[object, ...] = (),
+        on_outcome: OnOutcome | None = None,
+    ) -> list[R]:
         """``[function(task, *shared) for task in tasks]``.
 
         Args:
@@ -50,6 +62,7 @@ class Engine(Protocol):
             tasks: small ones; what they have in common belongs into ``shared``.
             shared: sent to a worker once, not once per task; it must not change afterwards. What it keeps to itself,
                 such as open simulations, it may keep from task to task, also of later calls.
+            on_outcome: called here as each task ends.
 
         Raises:
             FailedTasksError: after all other tasks, if some failed.
@@ -69,10 +82,16 @@ class LocalEngine:
     def __init__(self, on_progress: OnProgress | None = None):
         self._on_progress = on_progress
 
-    def map(self, function: Callable[..., R], tasks: Sequence[T], shared: tuple[object, ...] = ()) -> list[R]:
+    def map(
+        self,
+        function: Callable[..., R],
+        tasks: Sequence[T],
+        shared: tuple[object, ...] = (),
+        on_outcome: OnOutcome | None = None,
+    ) -> list[R]:
         """See :meth:`Engine.map`."""
         outcomes = ((i, _attempt(function, task, *shared)) for i, task in enumerate(tasks))
-        return _collect(outcomes, tasks, self._on_progress)
+        return _collect(outcomes, tasks, self._on_progress, on_outcome)
 
 
 class RayEngine:
@@ -89,6 +108,8 @@ class RayEngine:
 
     Raises:
         ImportError: without Ray.
+        ConnectionError: after 5 s at most, if nothing answers at the address.
+        ValueError: for an address that is none.
     """
 
     num_threads = 1
@@ -99,12 +120,19 @@ class RayEngine:
         except ImportError:
             raise ImportError('the engine "ray" needs Ray: pip install "simopt-envs[ray]"') from None
         if not ray.is_initialized():
+            _require_answer(address)
             ray.init(address=address, include_dashboard=False, log_to_driver=False)
         self._run: Any = ray.remote(num_cpus=1, max_retries=max_retries)(_run_in_worker)
         self._on_progress = on_progress
         self._sent: dict[int, tuple[object, Any]] = {}  # what the last call shared, by identity
 
-    def map(self, function: Callable[..., R], tasks: Sequence[T], shared: tuple[object, ...] = ()) -> list[R]:
+    def map(
+        self,
+        function: Callable[..., R],
+        tasks: Sequence[T],
+        shared: tuple[object, ...] = (),
+        on_outcome: OnOutcome | None = None,
+    ) -> list[R]:
         """See :meth:`Engine.map`."""
         import ray
 
@@ -112,11 +140,25 @@ class RayEngine:
         references = [self._sent[id(x)][1] for x in shared]
         pending = {self._run.remote(function, task, references): i for i, task in enumerate(tasks)}
         try:
-            return _collect(_finished(pending), tasks, self._on_progress)
+            return _collect(_finished(pending), tasks, self._on_progress, on_outcome)
         except BaseException:  # of all, Ctrl-C
             for reference in pending:
                 ray.cancel(reference, force=True)
             raise
+
+
+def _require_answer(address: str | None) -> None:
+    """Raise where ``ray.init`` would wait for long: nothing listens at the address of the cluster."""
+    address = address or os.environ.get("RAY_ADDRESS")
+    if address in (None, "auto", "local"):
+        return
+    parts = urlsplit(address if "://" in address else f"//{address}")
+    if not parts.hostname or not parts.port:
+        raise ValueError(f"the address of a Ray cluster is HOST:PORT, auto or local, got {address!r}")
+    try:
+        socket.create_connection((parts.hostname, parts.port), _SECONDS_TO_CONNECT).close()
+    except OSError as error:
+        raise ConnectionError(f"no Ray cluster answers at {address}: {error}") from None
 
 
 _received: dict[Any, object] = {}
@@ -158,7 +200,12 @@ def _attempt(function: Callable[..., R], *arguments: Any) -> R | Exception:
         return error
 
 
-def _collect(outcomes: Iterator[tuple[int, Any]], tasks: Sequence[object], on_progress: OnProgress | None) -> list[Any]:
+def _collect(
+    outcomes: Iterator[tuple[int, Any]],
+    tasks: Sequence[object],
+    on_progress: OnProgress | None,
+    on_outcome: OnOutcome | None,
+) -> list[Any]:
     results: list[Any] = [None] * len(tasks)
     failures: dict[int, Exception] = {}
     for done, (i, outcome) in enumerate(outcomes, 1):
@@ -166,6 +213,8 @@ def _collect(outcomes: Iterator[tuple[int, Any]], tasks: Sequence[object], on_pr
             failures[i] = outcome
         else:
             results[i] = outcome
+        if on_outcome is not None:
+            on_outcome(i, outcome)
         if on_progress is not None:
             on_progress(done, len(tasks))
     if failures:

@@ -1,18 +1,21 @@
 """The figures of a gap report, and the page."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import pytest
 from conftest import needs_effects
 
+from simopt_envs.gap.confusion import Partner, Separation
 from simopt_envs.gap.describe import Curve
 from simopt_envs.gap.figures import candidates_figure, curve_figure, error_figure, overlay_figure, regime_figure
+from simopt_envs.gap.hypothesis import Candidate
 from simopt_envs.gap.localise import Partition, Row, tabulate
 from simopt_envs.gap.report import diff, effects, table, warnings
+from simopt_envs.gap.result import Estimate, Named
 from simopt_envs.measured.channels import Channel
+from simopt_envs.measured.recording import Recording
 from simopt_envs.measured.states import States
 from simopt_envs.measured.windows import Windows
+from simopt_envs.physics.effects import EFFECTS
 from simopt_envs.report.figures import save_figure
 from simopt_envs.report.page import write_page
 
@@ -93,34 +96,20 @@ def test_candidates_and_curve(tmp_path):
     assert len(axis.lines) == 4 + 1 + 1  # each recording, all together, zero
 
 
-@dataclass
-class Named:
-    """What the report asks of an effect."""
-
-    candidate: object
-    parameters: dict
-    partners: tuple
-
-
-@dataclass
-class Thing:
-    """Any object with some attributes."""
-
-    def __init__(self, text="", **attributes):
-        self.text = text
-        self.__dict__.update(attributes)
-
-    def __str__(self):
-        return self.text
-
-
 def test_sections_say_it_in_html(tmp_path):
-    coulomb = Thing(effect=Thing(name="coulomb_friction", law="f = -F sign(v)"), place="joint:elbow")
-    estimate = Thing(value=0.208, unit="N m", interval95=(0.201, 0.216))
-    partner = Thing(candidate=Thing("deadband at actuator:e"), correlation=0.93, behind=12.0)
-    named = Named(coulomb, {"frictionloss": estimate}, (partner,))
+    coulomb = Candidate(EFFECTS["coulomb_friction"], "joint:elbow")
+    deadband, delay, bias = (
+        Candidate(EFFECTS[name], "actuator:e") for name in ("deadband", "actuator_delay", "actuator_bias")
+    )
+    commands = Recording(np.arange(3) * 0.02, {"ctrl/e": np.zeros(3)}, "fast reversals")
+    partners = (
+        Partner(deadband, 0.93, 12.0, Separation(commands, 0.4, nats=140.2, nats_recorded=3.1)),
+        Partner(delay, 0.92, None, Separation(commands, 0.99, nats=0.7, nats_recorded=0.2)),
+        Partner(bias, 0.91, None),
+    )
+    named = Named(coulomb, {"frictionloss": Estimate(0.208, "N m", (0.201, 0.216))}, {}, partners)
     sections = [
-        *effects([named], {"deadband at actuator:e": "reverse slowly"}),
+        *effects([named]),
         diff("--- a\n+++ b\n@@ -1 +1 @@\n-<joint/>\n+<joint frictionloss='0.2'/>\n"),
         *warnings(["qpos/elbow: gaps"]),
         table("Empty", ("a", "b"), [], hint="nothing moved"),
@@ -128,9 +117,16 @@ def test_sections_say_it_in_html(tmp_path):
     page = write_page(tmp_path / "report.html", "title", "subtitle", sections).read_text()
     for text in ("coulomb_friction at joint:elbow", "0.201 … 0.216", "f = -F sign(v)", "12 nats behind"):
         assert text in page
-    assert "deadband at actuator:e</code> (correlation 0.93, 12 nats behind): reverse slowly" in page
+    for text in (
+        "deadband at actuator:e</code> (correlation 0.93, 12 nats behind): to tell them apart: fast reversals (expected"
+        " 140 nats; the recordings here: 3), commands in separate/coulomb_friction.elbow_vs_deadband.e.csv",
+        "actuator_delay at actuator:e</code> (correlation 0.92): no motion tried would tell them apart",
+        "actuator_bias at actuator:e</code> (correlation 0.91): nothing to command",
+    ):
+        assert text in page
+    assert "vs_actuator_delay" not in page  # there is no such file
     assert "&lt;joint frictionloss=&#39;0.2&#39;/&gt;" in page
     assert "qpos/elbow: gaps" in page
     assert "nothing moved" in page
-    assert list(effects([], {})) == []
+    assert list(effects([])) == []
     assert list(warnings([])) == []

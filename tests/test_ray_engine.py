@@ -1,14 +1,20 @@
 """The engines: the same results from this process and from Ray's workers, also where one of them is killed."""
 
+from __future__ import annotations
+
 import json
 import os
 import signal
+import socket
 import sys
 import time
+from dataclasses import dataclass
 
+import mujoco
 import numpy as np
 import pytest
-from conftest import needs_batch
+from conftest import needs_batch, needs_effects
+from gap_plant import MODEL, record
 from test_cli import PENDULUM as PENDULUM_MODEL
 from test_cli import XI
 from test_replay_adaptation import SPACE as PENDULUM
@@ -18,6 +24,8 @@ from toy_reach import SPACE, PushPolicy, ReachEnv
 from baselines.cli import main
 from simopt_envs.adaptation import EnvSimulator, HiddenSystem, ReplaySimulator, window_trajectories
 from simopt_envs.engine import FailedTasksError, LocalEngine, RayEngine
+from simopt_envs.gap import find_gap
+from simopt_envs.physics.effects import EFFECTS
 
 ray = pytest.importorskip("ray", reason="Ray is not installed")
 
@@ -92,6 +100,23 @@ def test_what_is_shared_is_sent_once(monkeypatch):
     assert len(sent) == 2
     engine.map(weighted, range(2), (np.zeros(3), "path"))
     assert len(sent) == 3
+
+
+def test_an_address_where_nothing_answers_is_told_at_once(monkeypatch):
+    with socket.socket() as taken, monkeypatch.context() as patch:
+        taken.bind(("127.0.0.1", 0))  # and does not listen
+        address = f"127.0.0.1:{taken.getsockname()[1]}"
+        patch.setattr(ray, "is_initialized", lambda: False)
+        patch.setattr(ray, "init", lambda **_: pytest.fail("Ray would wait for the cluster"))
+        began = time.monotonic()
+        with pytest.raises(ConnectionError, match=f"no Ray cluster answers at {address}: .*refused"):
+            RayEngine(address)
+        assert time.monotonic() - began < 6.0
+        with pytest.raises(ValueError, match="is HOST:PORT, auto or local, got 'head'"):
+            RayEngine("head")
+        patch.setattr(ray, "init", lambda **_: None)
+        taken.listen()
+        RayEngine(address)
 
 
 def test_ctrl_c_cancels_what_is_left():
@@ -195,3 +220,118 @@ def test_the_command_line_gives_the_same_result_with_ray(tmp_path, monkeypatch, 
     with pytest.raises(SystemExit):
         main([*typed, "--out", "third", "--ray-address", "auto"])
     assert "--ray-address auto needs --engine ray" in capsys.readouterr().err
+
+
+# -- candidates of the gap workflow ------------------------------------------------------------------------------------
+
+FEW = [EFFECTS[name] for name in ("coulomb_friction", "viscous_friction", "actuator_bias")]
+
+
+@pytest.fixture(scope="module")
+def recordings():
+    law = lambda q, v: np.array([0.0, -0.4 * np.tanh(v[1] / 0.01)])  # noqa: E731
+    return record(law, np.random.default_rng(1), count=2, seconds=1.5)
+
+
+@needs_effects
+def test_candidates_are_fitted_the_same_bit_by_bit(recordings):
+    found, told = [], []
+    for engine in (LocalEngine(), RayEngine()):
+        told.append([])
+        gap = find_gap(
+            mujoco.MjSpec.from_string(MODEL),
+            recordings,
+            effects=FEW,
+            engine=engine,
+            progress=lambda *now, log=told[-1]: log.append(now),
+        )
+        found.append(gap)
+    local, remote = found
+    assert told[0] == told[1]
+    assert ("refit", 0, 6) in told[0]
+    assert ("refit", 6, 6) in told[0]
+    assert local.effects[0].candidate.place == "joint:elbow"
+    for one, other in zip(local.explanation.stages, remote.explanation.stages, strict=True):
+        assert [str(score.candidate) for score in one.scores] == [str(score.candidate) for score in other.scores]
+        for mine, its in zip(one.scores, other.scores, strict=True):
+            np.testing.assert_array_equal(mine.trial.fit.u, its.trial.fit.u)
+            np.testing.assert_array_equal(mine.trial.fit.jacobian, its.trial.fit.jacobian)
+            np.testing.assert_array_equal(mine.trial.held_out, its.trial.held_out)
+    assert local.to_dict() | {"seconds": 0} == remote.to_dict() | {"seconds": 0}
+    assert local.spec.to_xml() == remote.spec.to_xml()
+
+
+@needs_effects
+def test_a_candidate_whose_fit_fails_is_named_and_the_others_need_not_be_fitted_again(
+    recordings, monkeypatch, tmp_path
+):
+    from simopt_envs.gap import search
+
+    fitted, broken, real = [], "actuator_bias at actuator:elbow", search.fit
+
+    def fit(misfit, start, iterations, known=None):
+        fitted.append(" and ".join(map(str, misfit.hypothesis.candidates)))
+        if fitted[-1] == broken:
+            raise np.linalg.LinAlgError("singular")
+        return real(misfit, start, iterations, known)
+
+    def find(found_in, recordings=recordings):
+        fitted.clear()
+        return find_gap(mujoco.MjSpec.from_string(MODEL), recordings, effects=FEW, directory=found_in)
+
+    monkeypatch.setattr(search, "fit", fit)
+    with pytest.raises(FailedTasksError, match=f"1 of 6 .* {broken}: LinAlgError: singular"):
+        find(tmp_path)
+    assert len(fitted) == 8  # the base twice, the first time for its noise
+    with pytest.raises(ValueError, match=r"settings: recordings was .*, is now"):
+        find(tmp_path, recordings[:1])
+    broken = None
+    resumed = find(tmp_path)
+    assert fitted[0] == "actuator_bias at actuator:elbow"
+    again = len(fitted)
+    assert find(None).to_dict() | {"seconds": 0} == resumed.to_dict() | {"seconds": 0}
+    assert len(fitted) == again + 7
+
+
+# -- cells of the experiments ------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Learn:
+    """Settings that need a training, all of them the same one."""
+
+    number: int
+    fails: bool = False
+
+    def run(self, seed, workspace):
+        from baselines.experiments.environments import PENDULUM as ENV
+        from baselines.experiments.environments import Randomization
+
+        training = workspace.train(ENV, Randomization.none(ENV).gaussian(), 0)
+        if self.fails:
+            raise RuntimeError("on purpose")
+        weights = [float(values.double().sum()) for values in training.policy.actor.state_dict().values()]
+        return {"number": self.number, "weights": weights, "curve": training.curve}
+
+
+def test_cells_that_share_a_training_run_side_by_side(tmp_path, capsys):
+    pytest.importorskip("torch", reason="the experiments train with torch")
+    from baselines.experiments.cell import Cell, Store
+    from baselines.experiments.runner import run_cells
+    from baselines.experiments.workspace import SMOKE, Workspace
+
+    cells = [Cell("q", "c", number, Learn(number, fails=number == 1)) for number in range(4)]
+    results = []
+    for engine in (LocalEngine(), RayEngine()):
+        folder = tmp_path / type(engine).__name__
+        store = Store(folder / "cells", SMOKE)
+
+        def workspace(tell, folder=folder):
+            return Workspace(folder, SMOKE, tell)
+
+        assert run_cells(cells, store, workspace, engine=engine) == [cells[1]]
+        results.append(store.results(cells)["c"])
+        assert len([path for path in (folder / "policies").iterdir() if path.is_dir()]) == 1
+    assert results[0] == results[1]
+    assert list(results[0]) == [0, 2, 3]
+    assert capsys.readouterr().out.count("q/c-1: failed, RuntimeError: on purpose") == 2

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
 from baselines.commands import inputs
+from baselines.commands.engines import EngineOptions
 from baselines.commands.parameter_file import read_parameters
 from baselines.commands.progress import Display
 from baselines.commands.recordings import HeldOut, read_split
@@ -18,7 +19,6 @@ from simopt_envs.adaptation import CEM, REPS, EnvSimulator, HiddenSystem, Record
 from simopt_envs.adaptation.checkpoint import write_json
 from simopt_envs.adaptation.fitting import CMAES, LeastSquares, WindowMisfit, untold_combinations
 from simopt_envs.adaptation.updates import Update
-from simopt_envs.engine import Engine, LocalEngine, RayEngine
 from simopt_envs.physics import ModelWriter
 from simopt_envs.report import Details, write_report
 
@@ -73,11 +73,8 @@ class Adapt:
     """How p(ξ) is updated. Model: also by a fit to all windows, with a Laplace covariance."""
     epsilon: float = 1.0
     """Bound of the KL divergence of an update, in nats."""
-    engine: Literal["local", "ray"] = "local"
-    """What simulates the rollouts of an update: this machine's cores, or tasks of Ray. The results are the same."""
-    ray_address: str | None = None
-    """With --engine ray: address of the cluster (HOST:PORT, or auto); by default the one that this machine is part of,
-    else this machine alone."""
+    where: Annotated[EngineOptions, tyro.conf.arg(name="")] = field(default_factory=EngineOptions)
+    """What simulates the rollouts of an update."""
     seed: int = 0
     """Seed of everything random."""
     resume: bool = False
@@ -86,8 +83,6 @@ class Adapt:
     def run(self, typed: str) -> None:
         """Adapt and report; ``typed`` is the command line."""
         inputs.require_free(self.out, self.resume)
-        if self.ray_address is not None and self.engine != "ray":
-            raise ValueError(f"--ray-address {self.ray_address} needs --engine ray")
         if Path(self.system).suffix in MODEL_SUFFIXES:
             self._adapt_model(typed)
         else:
@@ -102,7 +97,7 @@ class Adapt:
             raise ValueError(f"{self.system} needs --target target.json, the hidden system to adapt to")
         target = inputs.Target.read(self.target)
         display = Display()
-        simulator = EnvSimulator(self.system, engine=self._engine(display))
+        simulator = EnvSimulator(self.system, engine=self.where.make(display.tasks))
         real_rollouts = 3 if self.real_rollouts is None else self.real_rollouts
         loop = SimOpt(
             simulator,
@@ -150,7 +145,7 @@ class Adapt:
         real_rollouts = len(trajectories) if self.real_rollouts is None else self.real_rollouts
         display = Display()
         loop = SimOpt(
-            ReplaySimulator(model, prior.space, windows, self._engine(display)),
+            ReplaySimulator(model, prior.space, windows, self.where.make(display.tasks)),
             prior,
             None,
             RecordedSystem(trajectories),
@@ -180,11 +175,6 @@ class Adapt:
         write_report(self.out)
         for finding in findings:
             display.say(finding)
-
-    def _engine(self, display: Display) -> Engine:
-        if self.engine == "ray":
-            return RayEngine(self.ray_address, display.tasks)
-        return LocalEngine(display.tasks)
 
     def _update(self) -> Update:
         return REPS(epsilon=self.epsilon) if self.update == "reps" else CEM(epsilon=self.epsilon)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import shutil
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,6 +13,7 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
+from baselines.commands.engines import EngineOptions
 from baselines.commands.inputs import distribution, existing, require_free
 from baselines.commands.parameter_file import read_parameters
 from baselines.commands.recordings import existing_logs
@@ -20,6 +22,7 @@ from simopt_envs.physics import ParameterSpace
 
 HOME = "home"
 """Keyframe of an environment's model where its joints are when an episode begins."""
+_FITS = ".fits"
 
 
 @dataclass(frozen=True)
@@ -31,7 +34,8 @@ class Gap:
     data: tuple[Path, ...]
     """Recordings; half of them are held out."""
     out: Path
-    """Folder for gap.json, report.html, model.repaired.xml, model.diff and plots."""
+    """Folder for gap.json, report.html, model.repaired.xml, model.diff and plots. The same command goes on from the
+    fits that are finished, if it was stopped."""
     mapping: Path | None = None
     """YAML file that names the columns of foreign logs."""
     config: Path | None = None
@@ -39,6 +43,9 @@ class Gap:
     of an environment the first p(ξ) of adapt."""
     keyframe: str | None = None
     """Where joints start that no column tells of; by default the model's reference, of an environment its home."""
+
+    where: Annotated[EngineOptions, tyro.conf.arg(name="")] = field(default_factory=EngineOptions)
+    """What fits the candidates."""
 
     def run(self, typed: str) -> None:
         """Find the gap, and print it; ``typed`` is the command line."""
@@ -54,7 +61,7 @@ class Gap:
             keyframe = keyframe or HOME
         if self.config is not None:
             plain = read_parameters(self.config)
-        console = Console(highlight=False)
+        engine, console = self.where.make(), Console(highlight=False)
         with Progress(
             TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), console=console, transient=True
         ) as bar:
@@ -63,9 +70,19 @@ class Gap:
             def show(what: str, done: int, total: int) -> None:
                 bar.update(task, description=what, completed=done, total=total)
 
-            gap = find_gap(model, logs, plain=plain, mapping=self.mapping, keyframe=keyframe, progress=show)
+            gap = find_gap(
+                model,
+                logs,
+                plain=plain,
+                mapping=self.mapping,
+                keyframe=keyframe,
+                progress=show,
+                engine=engine,
+                directory=self.out / _FITS,
+            )
         console.print(str(gap))
         console.print(f"report: {gap.save(self.out) / 'report.html'}")
+        shutil.rmtree(self.out / _FITS)
 
 
 def environment(env_id: str) -> tuple[mujoco.MjSpec, Gaussian]:

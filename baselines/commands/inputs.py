@@ -39,8 +39,9 @@ DEFAULT_VARY: Mapping[str, Mapping[str, float]] = {
 }
 """First standard deviations by environment: relative for logarithmic parameters, else in the parameter's unit."""
 
-UPDATES = 10
-"""Updates of p(ξ) per iteration: at most 1.4 standard deviations each, they cross several centimetres of cabinet."""
+UPDATES = 20
+"""Updates of p(ξ) per iteration: at most 1.4 standard deviations each, they cross several centimetres of cabinet, or
+the 15 standard deviations between a swing-peg and one with a longer rope and a weaker arm."""
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """The paper's questions as experiments that anyone can run again.
 
-    python -m baselines.experiments [QUESTION ...] [--quick]
+    python -m baselines.experiments [QUESTION ...] [--quick] [--engine ray]
 
 A question declares cells: one condition with one seed each, independent of each other. A cell's result is a JSON file;
 what is finished is not run again, and what several cells need (a trained policy, a run of SimOpt) is made once. From

@@ -1,14 +1,15 @@
-"""The command line: ``python -m baselines.experiments [QUESTION ...] [--quick]``."""
+"""The command line: ``python -m baselines.experiments [QUESTION ...] [--quick] [--engine ray]``."""
 
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
+from baselines.commands.engines import EngineOptions
 from baselines.experiments import ablations, iterations, learned_distribution, randomization, robots, update_rules
 from baselines.experiments.cell import Store
 from baselines.experiments.document import Question, write_document
@@ -31,13 +32,16 @@ class Experiments:
     quick: bool = False
     """Only a part: fewer seeds and conditions, a quarter of an hour on two cores for all questions."""
     out: Path = Path("out/experiments")
-    """Folder for results, policies and runs of SimOpt."""
+    """Folder for results, policies and runs of SimOpt. The machines of a Ray cluster must share it."""
     docs: Path = Path("docs/experiments")
     """Folder for the pages and figures."""
     report: bool = False
     """Run nothing; write the pages of what is finished."""
     smoke: bool = False
     """Spend next to nothing on each cell, to see that all of them run; the figures then mean nothing."""
+
+    where: Annotated[EngineOptions, tyro.conf.arg(name="")] = field(default_factory=EngineOptions)
+    """What runs the cells."""
 
     def __post_init__(self) -> None:
         for name in self.questions:
@@ -47,12 +51,13 @@ class Experiments:
     def run(self) -> int:
         """Run and write; the exit code."""
         effort = SMOKE if self.smoke else Effort()
-        store = Store(self.out / "cells", effort)
+        out = self.out.resolve()  # workers have another working directory
+        store = Store(out / "cells", effort)
         chosen = [QUESTIONS[name] for name in self.questions or QUESTIONS]
         failed = []
         if not self.report:
             cells = [cell for question in chosen for cell in question.cells() if cell.quick or not self.quick]
-            failed = run_cells(cells, store, lambda tell: Workspace(self.out, effort, tell))
+            failed = run_cells(cells, store, lambda tell: Workspace(out, effort, tell), engine=self.where.make())
         for question in chosen:
             page = write_document(question, store, self.docs)
             print(f"{question.name}: {page or 'nothing is finished yet'}")
@@ -66,7 +71,7 @@ def main() -> None:
     except KeyboardInterrupt as interrupt:
         print(f"\n{interrupt}", file=sys.stderr)
         sys.exit(130)
-    except (ValueError, ImportError) as error:
+    except (ValueError, ImportError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
 

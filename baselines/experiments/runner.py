@@ -1,4 +1,4 @@
-"""Running cells one after the other, shown as they go."""
+"""Running cells, shown as they go."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from baselines.experiments.cell import Cell, Store
 from baselines.experiments.workspace import Workspace
+from simopt_envs.engine import Engine, FailedTasksError, LocalEngine
 
 
 def run_cells(
@@ -17,14 +18,17 @@ def run_cells(
     store: Store,
     make_workspace: Callable[[Callable[[str], None]], Workspace],
     console: Console | None = None,
+    engine: Engine | None = None,
 ) -> list[Cell]:
     """Run those that are not finished. One that fails does not keep the others from running.
 
     Args:
-        cells: in this order.
+        cells: begun in this order.
         store: where the results go.
         make_workspace: given what to tell about the work within a cell.
         console: standard output by default.
+        engine: runs them, one after the other by default. Its workers write into the store and the workspace
+            themselves: on several machines, both must be in a folder that all of them share.
 
     Returns:
         The cells that failed.
@@ -34,7 +38,7 @@ def run_cells(
     """
     console = console or Console(highlight=False)
     todo = [cell for cell in cells if store.load(cell) is None]
-    failed = []
+    failed: list[Cell] = []
     bar = Progress(
         TextColumn("{task.description}"),
         BarColumn(bar_width=20),
@@ -47,23 +51,44 @@ def run_cells(
     )
     console.print(f"{len(cells)} cells, {len(cells) - len(todo)} of them finished before")
     with bar:
-        task = bar.add_task("", total=len(cells), completed=len(cells) - len(todo), doing="")
+        task = bar.add_task("", total=len(cells), doing="")
         workspace = make_workspace(lambda text: bar.update(task, doing=text))
-        for number, cell in enumerate(todo, 1):
-            bar.update(task, description=str(cell), doing="")
-            start = time.perf_counter()
-            try:
-                result = cell.settings.run(cell.seed, workspace)
-            except KeyboardInterrupt:
-                raise KeyboardInterrupt(
-                    f"interrupted in {cell}; {number - 1} of {len(todo)} cells are new. The same command goes on"
-                ) from None
-            except Exception as error:  # of whatever a cell runs; it is told below and by the exit code
+        unfinished = dict(enumerate(todo))
+
+        def show() -> None:
+            bar.update(task, completed=len(cells) - len(unfinished), description=_first(unfinished), doing="")
+
+        def note(index: int, outcome: float | Exception) -> None:
+            cell = unfinished.pop(index)
+            if isinstance(outcome, Exception):
                 failed.append(cell)
-                console.print(f"{cell}: failed, {type(error).__name__}: {error}", markup=False)
+                told = f"failed, {type(outcome).__name__}: {outcome}"
             else:
-                seconds = time.perf_counter() - start
-                store.save(cell, result, seconds)
-                console.print(f"{cell}: {seconds:.0f} s ({number} of {len(todo)})", markup=False)
-            bar.advance(task)
+                told = f"{outcome:.0f} s ({len(todo) - len(unfinished)} of {len(todo)})"
+            console.print(f"{cell}: {told}", markup=False)
+            show()
+
+        show()
+        try:
+            (engine or LocalEngine()).map(_run, todo, (store, workspace), note)
+        except FailedTasksError:  # told above, and by the exit code
+            pass
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(
+                f"interrupted in {_first(unfinished)}; {len(todo) - len(unfinished)} of {len(todo)} cells are new. "
+                "The same command goes on"
+            ) from None
     return failed
+
+
+def _run(cell: Cell, store: Store, workspace: Workspace) -> float:
+    """Run a cell and keep its result; the seconds that it took."""
+    start = time.perf_counter()
+    result = cell.settings.run(cell.seed, workspace)
+    seconds = time.perf_counter() - start
+    store.save(cell, result, seconds)
+    return seconds
+
+
+def _first(unfinished: dict[int, Cell]) -> str:
+    return str(next(iter(unfinished.values()), ""))

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from filelock import FileLock
 from gymnasium.vector import VectorEnv
 
 from baselines.commands.inputs import UPDATES
@@ -82,7 +83,7 @@ class _Begun(TorchPPO):
 
 
 class Workspace:
-    """Makes what is not there yet, and gives what is.
+    """Makes what is not there yet, and gives what is. Of several processes that want the same, one makes it.
 
     Args:
         folder: holds it.
@@ -93,6 +94,10 @@ class Workspace:
     def __init__(self, folder: Path, effort: Effort, tell: Callable[[str], None] = lambda text: None):
         self.folder, self.effort, self.tell = folder, effort, tell
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """For another process, where there is nobody to tell."""
+        return Workspace, (self.folder, self.effort)
+
     def train(self, env: str, p: Gaussian, seed: int, start: Training | None = None) -> Training:
         """A policy trained under p(ξ): from scratch, or from where another training ended."""
         ppo = self.effort.ppo
@@ -100,23 +105,9 @@ class Workspace:
         made_with = {"env": env, "p": p.to_dict(), "ppo": asdict(ppo), "seed": seed, "start": begun}
         key = digest(made_with)
         folder = self.folder / "policies" / key
-        if not folder.exists():
-            curve = []
-            worlds, random = np.random.default_rng(seed).spawn(2)
-
-            def make_vector_env(num_envs: int) -> VectorEnv:
-                return simulator(env).make_vector_env(num_envs, p, int(worlds.integers(2**31)))
-
-            def note(progress: Progress) -> None:
-                curve.append((progress.steps, None if np.isnan(progress.success) else progress.success))
-                self._training(progress)
-
-            trainer = TorchPPO(ppo, on_progress=note)
-            policy = trainer(make_vector_env, None if start is None else start.policy, random)
-            unfinished = self._empty(folder.with_name(f".{key}"))
-            trainer.save(policy, unfinished / "policy.pt")
-            write_json(unfinished / "training.json", {**made_with, "curve": curve})
-            unfinished.rename(folder)
+        with _alone(folder):
+            if not folder.exists():
+                self._train(env, p, seed, start, folder, made_with)
         stored = json.loads((folder / "training.json").read_text(encoding="utf-8"))
         return Training(key, TorchPPO().load(folder / "policy.pt"), [tuple(point) for point in stored["curve"]])
 
@@ -139,9 +130,10 @@ class Workspace:
             directory=folder,
             on_event=self._event,
         )
-        for step in loop.run(cure.iterations, resume=True):
-            if step.target_success is not None and step.target_success >= cure.enough:
-                break
+        with _alone(folder):
+            for step in loop.run(cure.iterations, resume=True):
+                if step.target_success is not None and step.target_success >= cure.enough:
+                    break
         iterations: list[dict[str, Any]] = json.loads((folder / "result.json").read_text())["iterations"]
         iterations[0]["train_steps"] = begun.policy.steps_trained
         return iterations[: step.index + 1]
@@ -160,11 +152,27 @@ class Workspace:
         assert success is not None
         return success
 
-    @staticmethod
-    def _empty(folder: Path) -> Path:
-        shutil.rmtree(folder, ignore_errors=True)  # of a process that was killed
-        folder.mkdir(parents=True)
-        return folder
+    def _train(
+        self, env: str, p: Gaussian, seed: int, start: Training | None, folder: Path, made_with: dict[str, Any]
+    ) -> None:
+        curve = []
+        worlds, random = np.random.default_rng(seed).spawn(2)
+
+        def make_vector_env(num_envs: int) -> VectorEnv:
+            return simulator(env).make_vector_env(num_envs, p, int(worlds.integers(2**31)))
+
+        def note(progress: Progress) -> None:
+            curve.append((progress.steps, None if np.isnan(progress.success) else progress.success))
+            self._training(progress)
+
+        trainer = TorchPPO(self.effort.ppo, on_progress=note)
+        policy = trainer(make_vector_env, None if start is None else start.policy, random)
+        unfinished = folder.with_name(f".{folder.name}")
+        shutil.rmtree(unfinished, ignore_errors=True)  # of a process that was killed
+        unfinished.mkdir()
+        trainer.save(policy, unfinished / "policy.pt")
+        write_json(unfinished / "training.json", {**made_with, "curve": curve})
+        unfinished.rename(folder)
 
     def _training(self, progress: Progress) -> None:
         success = "" if np.isnan(progress.success) else f", success {progress.success:.0%}"
@@ -173,3 +181,9 @@ class Workspace:
     def _event(self, event: Event) -> None:
         if event.status == "started":
             self.tell(f"iteration {event.iteration}, {event.phase.replace('_', ' ')}")
+
+
+def _alone(folder: Path) -> FileLock:
+    """A context in which no other process makes a folder; the lock of one that is killed opens."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    return FileLock(folder.with_name(f"{folder.name}.lock"))

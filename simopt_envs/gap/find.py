@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 
 from simopt_envs.distributions.gaussian import Gaussian
+from simopt_envs.engine import Engine
 from simopt_envs.gap.describe import Residual, describe
 from simopt_envs.gap.error import held_out_errors
 from simopt_envs.gap.hypothesis import Candidate
@@ -20,6 +21,7 @@ from simopt_envs.gap.plain import Plain, plain_parameters
 from simopt_envs.gap.recordings import read_windows
 from simopt_envs.gap.result import Gap, judge, named_effects, repair
 from simopt_envs.gap.search import Data, Explanation, Progress, Search
+from simopt_envs.gap.separate import separate
 from simopt_envs.measured.mapping import LogMapping
 from simopt_envs.measured.readers import load_recordings
 from simopt_envs.measured.recording import Recording
@@ -38,6 +40,8 @@ def find_gap(
     keyframe: str | None = None,
     effects: Sequence[Effect] = tuple(EFFECTS.values()),
     progress: Progress = lambda *_: None,
+    engine: Engine | None = None,
+    directory: str | Path | None = None,
 ) -> Gap:
     """Find where a model and recordings disagree, and which physical effect is missing.
 
@@ -50,11 +54,15 @@ def find_gap(
         keyframe: where joints without a column start.
         effects: the library to search.
         progress: is told of what is being done.
+        engine: fits the candidates; this process by default. The result does not depend on it.
+        directory: keeps finished fits, from which a call with the same arguments goes on; None for none.
 
     Raises:
         FileNotFoundError: for a file that does not exist.
+        FailedTasksError: naming the candidate, where a fit fails.
         ImportError: where MuJoCo is older than 4.0.
-        ValueError: for a model that does not compile, recordings that do not fit it, or audits that found errors.
+        ValueError: for a model that does not compile, recordings that do not fit it, audits that found errors, or a
+            directory that keeps fits of something else.
     """
     require_mujoco()
     began = time.perf_counter()
@@ -66,11 +74,11 @@ def find_gap(
     data = read_windows(start.model, read, keyframe)
     motion = motion_of(start.model, read, keyframe)
     seen = tuple(c for effect in effects for c in _places(effect, start.model) if _shows(c, data.fitted))
-    explanation = Search(start, data, motion, seen, progress).run()
-    return _gap(given, explanation, data, time.perf_counter() - began)
+    explanation = Search(start, data, motion, seen, progress, engine, directory).run()
+    return _gap(given, explanation, data, keyframe, began)
 
 
-def _gap(given: mujoco.MjSpec, explanation: Explanation, data: Data, seconds: float) -> Gap:
+def _gap(given: mujoco.MjSpec, explanation: Explanation, data: Data, keyframe: str | None, began: float) -> Gap:
     null, final = explanation.null, explanation.final
     verdict = judge(explanation)
     if verdict == "unexplained":
@@ -81,16 +89,13 @@ def _gap(given: mujoco.MjSpec, explanation: Explanation, data: Data, seconds: fl
     errors = held_out_errors(data.held_out, models, null.sensor_noise, np.random.default_rng(_SEED))
     explained = Explanation(null, final, explanation.stages)
     spec, diff = repair(explained, given, fitted[1])
-    rows = localise(data.held_out, null.held_out, null.hypothesis.plain.model)
-    residuals = [
-        Residual(windows, errors, replace(noise, scale=final.sensor_noise))
-        for windows, errors, noise in (
-            (data.fitted, final.tolerance * final.fit.errors, final.noise),
-            (data.held_out, final.held_out, final.held_out_noise),
-        )
-    ]
+    rows = localise(data.held_out, null.whitened[1], null.hypothesis.plain.model)
+    noises = (replace(noise, scale=final.sensor_noise) for noise in (final.noise, final.held_out_noise))
+    residuals = list(map(Residual, (data.fitted, data.held_out), final.whitened, noises))
     left = describe(final.hypothesis, final.fit.u, residuals)
-    return Gap(verdict, named_effects(explained), errors, rows, left, explanation, data, spec, diff, seconds)
+    named = separate(named_effects(explained), explained, data, keyframe)
+    seconds = time.perf_counter() - began
+    return Gap(verdict, named, errors, rows, left, explanation, data, spec, diff, seconds)
 
 
 def _spec(model: str | Path | mujoco.MjSpec) -> mujoco.MjSpec:

@@ -77,15 +77,16 @@ class Misfit:
     Args:
         hypothesis: what is simulated.
         windows: what it is compared with.
+        num_threads: that simulate; 0 for one per core.
 
     Attributes:
         noise: that errors are counted in: 1 in all channels, until :meth:`with_noise`.
     """
 
-    def __init__(self, hypothesis: Hypothesis, windows: Windows):
+    def __init__(self, hypothesis: Hypothesis, windows: Windows, num_threads: int = 0):
         self.hypothesis = hypothesis
         self.noise = Noise.of(np.ones(len(windows.channels)), np.zeros((1, *windows.measured.shape)))
-        self._simulate = hypothesis.simulator(windows)
+        self._simulate = hypothesis.simulator(windows, num_threads)
         self._measured = windows.measured
         self._counted = np.isfinite(windows.measured)
 
@@ -137,6 +138,17 @@ class Misfit:
         return np.sqrt(np.nanmean(np.where(kink, np.nan, second) ** 2, axis=0) / 6.0)
 
 
+class _HalfSquares(minimize.Norm):
+    """1/2 |r|² and its derivatives, summed without BLAS: what that gives depends on how many threads it has."""
+
+    def value(self, r: Array) -> np.float64:
+        return np.float64(0.5 * np.sum(r**2))
+
+    def grad_hess(self, r: Array, proj: Array) -> tuple[Array, Array]:
+        columns = np.ascontiguousarray(proj.T)
+        return np.einsum("im,mk->ik", columns, r), np.einsum("im,jm->ij", columns, columns)
+
+
 def fit(misfit: Misfit, start: Array, iterations: int, known: Array | None = None) -> Fit:
     """The most probable u.
 
@@ -166,6 +178,7 @@ def fit(misfit: Misfit, start: Array, iterations: int, known: Array | None = Non
         residual,
         bounds=[hypothesis.low, hypothesis.high],
         jacobian=jacobian,
+        norm=_HalfSquares(),
         xtol=1e-2,
         x_scale="jac",  # damping relative to what the data say of each coordinate
         mu_min=1e-3,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -123,9 +124,13 @@ class Hypothesis:
         """Coordinates (d,) with those of one candidate left out."""
         return np.delete(u, self.columns[candidate])
 
-    def simulator(self, windows: Windows) -> HypothesisSimulator:
-        """A simulator of windows for values of ξ."""
-        return HypothesisSimulator(self, windows)
+    def simulator(self, windows: Windows, num_threads: int = 0) -> HypothesisSimulator:
+        """A simulator of windows for values of ξ, on one thread per core by default."""
+        return HypothesisSimulator(self, windows, num_threads)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For another process, where it can be simulated: without the spec, as :class:`Plain`."""
+        return {name: value for name, value in self.__dict__.items() if name != "spec"}
 
     def _probes(self, candidate: Candidate) -> tuple[dict[str, float], ...]:
         return candidate.effect.probes(self.plain.model, candidate.place, self.motion)
@@ -137,7 +142,7 @@ class Hypothesis:
 class HypothesisSimulator:
     """Runs a hypothesis through windows; see :class:`~simopt_envs.measured.windows.WindowSimulator`."""
 
-    def __init__(self, hypothesis: Hypothesis, windows: Windows):
+    def __init__(self, hypothesis: Hypothesis, windows: Windows, num_threads: int = 0):
         self._given, self._sources = windows, command_sources(hypothesis.model)
         self.windows = replace(
             windows,
@@ -156,7 +161,7 @@ class HypothesisSimulator:
         self._timestep = float(hypothesis.model.opt.timestep)
         self._of_model = [i for i, p in enumerate(hypothesis.space) if not acts_on_columns(p)]
         space = ParameterSpace(hypothesis.space.parameters[i] for i in self._of_model)
-        self._simulate = WindowSimulator(hypothesis.model, self.windows, space)
+        self._simulate = WindowSimulator(hypothesis.model, self.windows, space, num_threads)
 
     def __call__(self, xi: Array | None = None, starts: States | None = None) -> Array:
         """Predicted columns (n, w, S, c) for ξ (n, d), by default the nominal one; NaN from where it diverged."""

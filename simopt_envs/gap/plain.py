@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -63,6 +64,10 @@ class Plain:
         prior = _with_lead(model, prior)
         ModelWriter(model, ParameterSpace(p for p in prior.space if not acts_on_columns(p)))  # raises where it cannot
         return cls(spec, model, prior)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For another process, without the spec: it cannot be sent, and its XML rounds to six digits."""
+        return {name: value for name, value in self.__dict__.items() if name != "spec"}
 
 
 def plain_parameters(spec: mujoco.MjSpec) -> Plain:

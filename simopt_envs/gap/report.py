@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from simopt_envs.gap import thresholds
+from simopt_envs.gap.confusion import Partner, commands_file
 from simopt_envs.gap.describe import Description
 from simopt_envs.gap.figures import candidates_figure, curve_figure, error_figure, overlay_figure, regime_figure
 from simopt_envs.gap.localise import Row
@@ -35,7 +36,6 @@ def write_report(
     folder: str | Path,
     rows: Sequence[Row],
     description: Description | None = None,
-    motions: Mapping[str, str] | None = None,
 ) -> Path:
     """Write ``report.html`` and its figures as PNG (folder ``plots``).
 
@@ -44,7 +44,6 @@ def write_report(
         folder: to write into; it is made.
         rows: where the refitted model and the recordings disagree.
         description: what the part that is not explained looks like.
-        motions: for a confounded partner, by what a candidate is called, the motion that would tell it apart.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -54,7 +53,7 @@ def write_report(
     found = [
         verdict(gap, description),
         *error(gap, plots),
-        *effects(gap.effects, motions or {}),
+        *effects(gap.effects),
         where(rows, plots),
         *left(description, plots),
         *candidates(gap, plots),
@@ -123,7 +122,7 @@ def error(gap: Gap, plots: _Plots) -> Iterator[Section]:
     )
 
 
-def effects(named: Sequence[Named], motions: Mapping[str, str]) -> Iterator[Section]:
+def effects(named: Sequence[Named]) -> Iterator[Section]:
     """What is missing: laws, numbers and what else it could be."""
     if not named:
         return
@@ -141,7 +140,7 @@ def effects(named: Sequence[Named], motions: Mapping[str, str]) -> Iterator[Sect
                     "name": str(partner.candidate),
                     "closeness": f"correlation {partner.correlation:.2f}"
                     + ("" if partner.behind is None else f", {_ahead(partner.behind)}"),
-                    "motion": motions.get(str(partner.candidate), ""),
+                    "motion": _motion(effect, partner),
                 }
                 for partner in effect.partners
             ],
@@ -248,6 +247,15 @@ def settings(gap: Gap) -> Section:
 def _ahead(behind: float) -> str:
     """How a partner stands to the effect named, in words."""
     return f"{abs(behind):.0f} nats {'behind' if behind > 0 else 'ahead'}"
+
+
+def _motion(effect: Named, partner: Partner) -> str:
+    """What to record next to tell an effect from a partner, in words."""
+    found = partner.separation
+    if found is None:
+        return "nothing to command: the model has no actuators, or no motion of them that stays near the recorded ones"
+    saved = f", commands in {commands_file(effect.candidate, partner.candidate)}" if found.separates else ""
+    return f"{found}{saved}"
 
 
 def table(

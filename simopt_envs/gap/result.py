@@ -10,7 +10,7 @@ from typing import Any, Literal
 import mujoco
 import numpy as np
 
-from simopt_envs.gap.confusion import Partner, partners
+from simopt_envs.gap.confusion import Partner, commands_file, partners
 from simopt_envs.gap.describe import Description
 from simopt_envs.gap.error import Errors
 from simopt_envs.gap.hypothesis import Candidate
@@ -111,7 +111,12 @@ class Gap:
                     },
                     "evidence": named.evidence,
                     "confounded_with": [
-                        {"effect": p.candidate.effect.name, "where": p.candidate.place, "correlation": p.correlation}
+                        {
+                            "effect": p.candidate.effect.name,
+                            "where": p.candidate.place,
+                            "correlation": p.correlation,
+                            "motion": _motion(named.candidate, p),
+                        }
                         for p in named.partners
                     ],
                 }
@@ -149,6 +154,8 @@ class Gap:
     def save(self, folder: str | Path) -> Path:
         """Write ``gap.json``, ``model.repaired.xml``, ``model.diff`` and the report with its plots into a folder.
 
+        Commands of motions that tell effects from their partners go into its folder ``separate``, as CSV.
+
         Raises:
             ImportError: without what the report needs, after all else is written.
         """
@@ -157,12 +164,30 @@ class Gap:
         (folder / "model.repaired.xml").write_text(self.spec.to_xml())
         (folder / "model.diff").write_text(self.diff)
         (folder / "gap.json").write_text(json.dumps(self.to_dict(), indent=1))
+        for effect in self.effects:
+            for partner in effect.partners:
+                if partner.separation is not None and partner.separation.separates:
+                    partner.separation.commands.save(folder / commands_file(effect.candidate, partner.candidate))
         try:
             from simopt_envs.gap.report import write_report
         except ImportError as error:
             raise ImportError('the report needs more packages: pip install "simopt-envs[report]"') from error
         write_report(self, folder, self.localisation, self.left)
         return folder
+
+
+def _motion(effect: Candidate, partner: Partner) -> dict[str, Any] | None:
+    """As in ``gap.json``; no file where the best motion does not tell them apart either."""
+    found = partner.separation
+    if found is None:
+        return None
+    return {
+        "file": commands_file(effect, partner.candidate) if found.separates else None,
+        "excitation": found.commands.name,
+        "correlation": found.correlation,
+        "nats": found.nats,
+        "nats_recorded": found.nats_recorded,
+    }
 
 
 def judge(explanation: Explanation) -> Verdict:

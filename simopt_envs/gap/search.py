@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 
+from simopt_envs.adaptation.checkpoint import Result
 from simopt_envs.adaptation.fitting import Noise
+from simopt_envs.engine import Engine, LocalEngine
 from simopt_envs.gap.fit import Fit, Misfit, fit
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
+from simopt_envs.gap.kept import kept_fits, key_of
 from simopt_envs.gap.plain import SPEAKS_FOR, Plain
 from simopt_envs.gap.thresholds import EVIDENCE, EXPLAINED, FAR, FURTHER, MOST_EFFECTS, REFITTED, SIMPLER, SIMPLER_SHARE
 from simopt_envs.measured.recording import Finding, Recording
@@ -83,6 +89,11 @@ class Base(Trial):
     def sensor_noise(self) -> Array:
         """Standard deviation of each channel's noise, (c,)."""
         return self.noise.scale / self.tolerance
+
+    @property
+    def whitened(self) -> tuple[Array, Array]:
+        """Errors fitted and held out, in units of the sensors' noise, (w, S, c)."""
+        return self.tolerance * self.fit.errors, self.held_out
 
 
 @dataclass(frozen=True)
@@ -191,6 +202,8 @@ class Search:
         motion: of the recordings.
         candidates: what may be missing.
         progress: is told of it.
+        engine: fits the candidates; this process by default.
+        directory: keeps finished fits, from which a search of the same goes on; None for none.
     """
 
     def __init__(
@@ -200,9 +213,12 @@ class Search:
         motion: Motion,
         candidates: Sequence[Candidate],
         progress: Progress = lambda *_: None,
+        engine: Engine | None = None,
+        directory: str | Path | None = None,
     ):
         self.plain, self.data, self.motion, self.candidates = plain, data, motion, tuple(candidates)
-        self._progress = progress
+        self._progress, self._engine = progress, engine or LocalEngine()
+        self._kept = kept_fits(directory, plain, motion, data.fitted, data.held_out)
         self._floor: Array | None = None
         self._tolerance = np.ones(len(data.fitted.channels))
 
@@ -231,12 +247,12 @@ class Search:
         if self._floor is None:  # what the first fit leaves is nearer to noise alone than what the model as given does
             self._progress("fit", 0, 2)
             floor = fitted.noise_floor(u)
-            u = fit(fitted.with_noise(fitted.noise_at(u, floor)), u, _ITERATIONS).u
+            u = self._fit(fitted.with_noise(fitted.noise_at(u, floor)), u).u
             self._floor = np.minimum(floor, fitted.noise_floor(u))
         self._progress("fit", 1, 2)
-        floor = self._floor * self._tolerance
-        noise, held_out_noise = fitted.noise_at(u, floor), held_out.noise_at(u, floor)
-        found = fit(fitted.with_noise(noise), u, _ITERATIONS)
+        scale = self._floor * self._tolerance
+        noise, held_out_noise = fitted.noise_at(u, scale), held_out.noise_at(u, scale)
+        found = self._fit(fitted.with_noise(noise), u)
         errors = self._tolerance * held_out.with_noise(held_out_noise).errors(found.u[None])[0]
         return Base(hypothesis, found, errors, noise, held_out_noise, self._tolerance)
 
@@ -250,10 +266,7 @@ class Search:
         screened.sort(key=lambda s: -s.gain)
         spoken_for = self._spoken_for(base)
         promising = screened[:REFITTED] + [s for s in screened[REFITTED:] if s.candidate in spoken_for]
-        trials = []
-        for done, one in enumerate(promising):
-            self._progress("refit", done, len(promising))
-            trials.append(self.trial(base, one, one.candidate in spoken_for))
+        trials = self.trials(base, [_Refit(one, one.candidate in spoken_for) for one in promising])
         best = min(trials, key=lambda trial: trial.fit.loss + 0.5 * np.sum((trial.held_out / base.tolerance) ** 2))
         worth = _worth(best)
         scores = [_score(base, s, t, worth) for s, t in zip(promising, trials, strict=True)]
@@ -284,29 +297,34 @@ class Search:
         promising = [s.starts for s in found if s.gain >= _WORTH_A_START * best.gain]
         return replace(best, starts=np.concatenate(promising))
 
-    def trial(self, base: Base, screened: Screened, spoken_for: bool = False) -> Trial:
-        """A candidate fitted together with all that the base has, whose derivatives are taken as known.
+    def trials(self, base: Base, refits: Sequence[_Refit]) -> list[Trial]:
+        """Candidates fitted, each together with all that the base has."""
+        keys = [
+            key_of(r.screened.hypothesis, base.fit.u, base.noise.scale, r.screened.starts, np.array(r.spoken_for))
+            for r in refits
+        ]
+        todo = [i for i, key in enumerate(keys) if not self._kept.has(key)]
+        done = itertools.count(len(refits) - len(todo) + 1)
+        self._progress("refit", len(refits) - len(todo), len(refits))
 
-        Where plain parameters far from their priors speak for the candidate, it is fitted from the priors' means too:
-        a base that they have bent is the end of a valley that leads away from the right one.
-        """
-        hypothesis = screened.hypothesis
-        misfit = Misfit(hypothesis, self.data.fitted).with_noise(base.noise)
-        found = fit(misfit, misfit.best(screened.starts), _ITERATIONS, known=base.fit.jacobian)
-        if spoken_for:
-            start = hypothesis.neutral()
-            effects = slice(base.hypothesis.num_plain, len(base.fit.u))
-            start[effects] = base.fit.u[effects]
-            probes = hypothesis.probes(screened.candidate)
-            probes[:, : len(base.fit.u)] = start[: len(base.fit.u)]
-            amounts = hypothesis.amounts(screened.candidate)
-            tried = np.tile(probes, (len(_SIZES), 1, 1))
-            tried[..., amounts] = start[amounts] + _SIZES[:, None, None] * (probes[:, amounts] - start[amounts])
-            tried = np.clip(tried.reshape(-1, len(start)), hypothesis.low, hypothesis.high)
-            other = fit(misfit, misfit.best(tried), _ITERATIONS)
-            found = min(found, other, key=lambda f: f.loss)
-        held_out = Misfit(hypothesis, self.data.held_out).with_noise(base.held_out_noise)
-        return Trial(hypothesis, found, base.tolerance * held_out.errors(found.u[None])[0])
+        def note(number: int, outcome: Result | Exception) -> None:
+            if not isinstance(outcome, Exception):
+                self._kept.phase(keys[todo[number]], lambda: outcome)
+            self._progress("refit", next(done), len(refits))
+
+        shared = base, self.data.fitted, self.data.held_out, self._engine.num_threads
+        found = dict(zip(todo, self._engine.map(_fitted, [refits[i] for i in todo], shared, note), strict=True))
+        trials = []
+        for i, (key, refit) in enumerate(zip(keys, refits, strict=True)):
+            arrays = self._kept.phase(key, partial(found.__getitem__, i))
+            held_out = arrays.pop("held_out")
+            trials.append(Trial(refit.screened.hypothesis, Fit(**arrays), held_out))
+        return trials
+
+    def _fit(self, misfit: Misfit, start: Array) -> Fit:
+        """A fit of all differences."""
+        key = key_of(misfit.hypothesis, start, misfit.noise.scale)
+        return Fit(**self._kept.phase(key, lambda: vars(fit(misfit, start, _ITERATIONS))))
 
     def _spoken_for(self, base: Base) -> list[Candidate]:
         """The candidates that plain parameters far outside their priors speak for; a linear screen cannot tell them."""
@@ -325,10 +343,46 @@ class Search:
             others = [e for e in effects if e != effect]
             without = self.base(others, base.hypothesis.without(effect, base.fit.u))
             screened = self.screen(without, effect)
-            with_it = self.trial(without, screened)
+            (with_it,) = self.trials(without, [_Refit(screened)])
             if not _score(without, screened, with_it, _worth(with_it)).earned:
                 return self._eliminated(without)
         return base
+
+
+@dataclass(frozen=True, repr=False)
+class _Refit:
+    """A task: to fit a candidate, which plain parameters far from their priors may speak for."""
+
+    screened: Screened
+    spoken_for: bool = False
+
+    def __repr__(self) -> str:
+        return str(self.screened.candidate)
+
+
+def _fitted(refit: _Refit, base: Base, fitted: Windows, held_out: Windows, num_threads: int) -> Result:
+    """The fit of a candidate, and its errors on what was held out; the base's derivatives are taken as known.
+
+    Where plain parameters far from their priors speak for the candidate, it is fitted from the priors' means too: a
+    base that they have bent is the end of a valley that leads away from the right one.
+    """
+    screened, hypothesis = refit.screened, refit.screened.hypothesis
+    misfit = Misfit(hypothesis, fitted, num_threads).with_noise(base.noise)
+    found = fit(misfit, misfit.best(screened.starts), _ITERATIONS, known=base.fit.jacobian)
+    if refit.spoken_for:
+        start = hypothesis.neutral()
+        effects = slice(base.hypothesis.num_plain, len(base.fit.u))
+        start[effects] = base.fit.u[effects]
+        probes = hypothesis.probes(screened.candidate)
+        probes[:, : len(base.fit.u)] = start[: len(base.fit.u)]
+        amounts = hypothesis.amounts(screened.candidate)
+        tried = np.tile(probes, (len(_SIZES), 1, 1))
+        tried[..., amounts] = start[amounts] + _SIZES[:, None, None] * (probes[:, amounts] - start[amounts])
+        tried = np.clip(tried.reshape(-1, len(start)), hypothesis.low, hypothesis.high)
+        other = fit(misfit, misfit.best(tried), _ITERATIONS)
+        found = min(found, other, key=lambda f: f.loss)
+    test = Misfit(hypothesis, held_out, num_threads).with_noise(base.held_out_noise)
+    return {**vars(found), "held_out": base.tolerance * test.errors(found.u[None])[0]}
 
 
 def _clipped(step: float, shift: Array, neutral: Array, hypothesis: Hypothesis, columns: list[int]) -> float:
@@ -353,9 +407,7 @@ def _chosen(null: Base, base: Base, scores: Sequence[Score]) -> Score | None:
         earned = [
             s
             for s in earned
-            if base.excess > right > s.trial.excess
-            or base.excess - s.trial.excess > least
-            or s.of_prior > 0.5 * FAR**2
+            if base.excess > right > s.trial.excess or base.excess - s.trial.excess > least or s.of_prior > 0.5 * FAR**2
         ]
     if not earned:
         return None

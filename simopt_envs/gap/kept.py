@@ -1,0 +1,48 @@
+"""Finished fits on disk, so that a search that was killed goes on from them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+import simopt_envs
+from simopt_envs.adaptation.checkpoint import Checkpoint, identity
+from simopt_envs.gap.hypothesis import Hypothesis
+from simopt_envs.gap.plain import Plain
+from simopt_envs.measured.windows import Windows
+from simopt_envs.physics.effects import Motion
+from simopt_envs.physics.parameters import Array
+
+
+def kept_fits(directory: str | Path | None, plain: Plain, motion: Motion, *windows: Windows) -> Checkpoint:
+    """Where fits are kept: in a folder, or nowhere.
+
+    Raises:
+        ValueError: if the folder holds fits of another model, other priors or other recordings, or of other versions.
+    """
+    if directory is None:
+        return Checkpoint(None, {}, resume=True)
+    model = np.empty(mujoco.mj_sizeModel(plain.model), dtype=np.uint8)
+    mujoco.mj_saveModel(plain.model, None, model)
+    settings = {
+        "model": _digest(model),
+        "priors": _digest(plain.prior.to_dict(), tuple(plain.prior.space)),
+        "recordings": _digest(motion, *windows),
+        "versions": [simopt_envs.__version__, mujoco.__version__, np.__version__],
+    }
+    return Checkpoint(Path(directory), settings, resume=True)
+
+
+def key_of(hypothesis: Hypothesis, *given: Array) -> str:
+    """What a fit of a hypothesis is called, for all that its result depends on besides the data."""
+    return _digest(list(map(str, hypothesis.candidates)), *given)
+
+
+def _digest(*content: Any) -> str:
+    as_json = json.dumps([item if isinstance(item, dict) else identity(item) for item in content])
+    return hashlib.sha256(as_json.encode()).hexdigest()[:16]
