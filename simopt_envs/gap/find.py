@@ -20,8 +20,9 @@ from simopt_envs.gap.motion import motion_of
 from simopt_envs.gap.plain import Plain, plain_parameters
 from simopt_envs.gap.recordings import read_windows
 from simopt_envs.gap.result import Gap, judge, named_effects, repair
-from simopt_envs.gap.search import Data, Explanation, Progress, Search
+from simopt_envs.gap.search import Explanation, Progress, Search
 from simopt_envs.gap.separate import separate
+from simopt_envs.gap.trial import Data
 from simopt_envs.measured.mapping import LogMapping
 from simopt_envs.measured.readers import load_recordings
 from simopt_envs.measured.recording import Recording

@@ -8,8 +8,8 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from simopt_envs.gap.search import Data
 from simopt_envs.gap.thresholds import WINDOW
+from simopt_envs.gap.trial import Data
 from simopt_envs.measured.audit import audited
 from simopt_envs.measured.recording import Finding, Recording
 from simopt_envs.measured.windows import cut_windows

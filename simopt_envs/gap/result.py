@@ -16,8 +16,9 @@ from simopt_envs.gap.error import Errors
 from simopt_envs.gap.hypothesis import Candidate
 from simopt_envs.gap.localise import Row
 from simopt_envs.gap.repair import column_lines, difference, repaired
-from simopt_envs.gap.search import Data, Explanation
+from simopt_envs.gap.search import Explanation
 from simopt_envs.gap.thresholds import EXPLAINED, LEAST_SHARE
+from simopt_envs.gap.trial import Data
 from simopt_envs.measured.recording import Finding
 from simopt_envs.physics.parameters import Array
 

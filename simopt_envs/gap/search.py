@@ -11,14 +11,14 @@ from pathlib import Path
 import numpy as np
 
 from simopt_envs.adaptation.checkpoint import Result
-from simopt_envs.adaptation.fitting import Noise
 from simopt_envs.engine import Engine, LocalEngine
 from simopt_envs.gap.fit import Fit, Misfit, fit
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
 from simopt_envs.gap.kept import kept_fits, key_of
 from simopt_envs.gap.plain import SPEAKS_FOR, Plain
-from simopt_envs.gap.thresholds import EVIDENCE, EXPLAINED, FAR, FURTHER, MOST_EFFECTS, REFITTED, SIMPLER, SIMPLER_SHARE
-from simopt_envs.measured.recording import Finding, Recording
+from simopt_envs.gap.selection import Score, chosen, left_by, score_of, worth_of
+from simopt_envs.gap.thresholds import FAR, MOST_EFFECTS, REFITTED
+from simopt_envs.gap.trial import Base, Data, Screened, Trial
 from simopt_envs.measured.windows import Windows
 from simopt_envs.physics.effects import Motion
 from simopt_envs.physics.parameters import Array
@@ -32,130 +32,6 @@ _WORTH_A_START = 0.2  # share of the best probe's gain at which a fit may start 
 _SIZES = np.array([-30.0, -10.0, -3.0, -1.0, 1.0, 3.0, 10.0, 30.0])  # probes, of an effect that is spoken for
 _FURTHEST = 20.0  # probes that the screen's step may be long
 _COARSE = 3.0  # times the sensors' noise, from which what a model leaves decides what a fit counts errors in
-
-
-@dataclass(frozen=True)
-class Data:
-    """Windows of recordings to fit, and of recordings that no fit sees.
-
-    Attributes:
-        fitted, held_out: the windows.
-        fitted_recordings, held_out_recordings: what they are cut from.
-        warnings: of the recordings' audit.
-    """
-
-    fitted: Windows
-    held_out: Windows
-    fitted_recordings: tuple[Recording, ...]
-    held_out_recordings: tuple[Recording, ...]
-    warnings: tuple[Finding, ...] = ()
-
-
-@dataclass(frozen=True)
-class Trial:
-    """A hypothesis fitted, and what it says of the recordings that were held out.
-
-    Attributes:
-        hypothesis: plain parameters and effects.
-        fit: of the fitted windows.
-        held_out: whitened errors there, in units of the sensors' noise, (w, S, c).
-    """
-
-    hypothesis: Hypothesis
-    fit: Fit
-    held_out: Array
-
-    @property
-    def excess(self) -> float:
-        """Mean square of the whitened held-out errors above that of noise alone, which is 1."""
-        return float(np.mean(self.held_out**2)) - 1.0
-
-
-@dataclass(frozen=True)
-class Base(Trial):
-    """A trial that others are compared with, and the noise they are all fitted in.
-
-    Attributes:
-        noise, held_out_noise: at its ξ.
-        tolerance: how many times the sensors' noise that noise is, (c,): what even the best model leaves, where it
-            leaves more. Fits in units of less would count priors for nothing.
-    """
-
-    noise: Noise
-    held_out_noise: Noise
-    tolerance: Array
-
-    @property
-    def sensor_noise(self) -> Array:
-        """Standard deviation of each channel's noise, (c,)."""
-        return self.noise.scale / self.tolerance
-
-    @property
-    def whitened(self) -> tuple[Array, Array]:
-        """Errors fitted and held out, in units of the sensors' noise, (w, S, c)."""
-        return self.tolerance * self.fit.errors, self.held_out
-
-
-@dataclass(frozen=True)
-class Screened:
-    """A candidate that acts linearly.
-
-    Attributes:
-        candidate: the effect and its place.
-        hypothesis: the base's with the candidate.
-        direction: what its best probe changes in the base's residual, plain parameters projected out, (m,).
-        gain: in -log p, of the best multiple of that probe.
-        starts: u from which a fit may start, (k, d).
-    """
-
-    candidate: Candidate
-    hypothesis: Hypothesis
-    direction: Array
-    gain: float
-    starts: Array
-
-
-@dataclass(frozen=True)
-class Score:
-    """What a candidate earns over the base, in nats.
-
-    Attributes:
-        screened: by the linear screen.
-        trial: its fit.
-        fitted: gain on the fitted windows and the prior, less the price of its parameters (BIC).
-        held_out: gain on the windows held out and the prior.
-        of_prior: the part of both that plain parameters give back, as they need not stand in for the effect any more.
-    """
-
-    screened: Screened
-    trial: Trial
-    fitted: float
-    held_out: float
-    of_prior: float
-
-    @property
-    def candidate(self) -> Candidate:
-        """The effect and its place."""
-        return self.screened.candidate
-
-    @property
-    def total(self) -> float:
-        """By which candidates are ranked."""
-        return self.fitted + self.held_out
-
-    @property
-    def earned(self) -> bool:
-        """Whether it may be called missing: it must show in what was fitted, and in recordings that no fit saw.
-
-        Less is asked of an effect that plain parameters can stand in for: all it can show is how far they had to go.
-        """
-        stood_in_for = self.candidate.effect.name in SPEAKS_FOR.values() and self.of_prior > 0.5 * FAR**2
-        least = 0.0 if stood_in_for else EVIDENCE
-        return (
-            self.fitted > least
-            and self.held_out > least
-            and self.trial.hypothesis.is_itself(self.candidate, self.trial.fit.u)
-        )
 
 
 @dataclass(frozen=True)
@@ -226,13 +102,13 @@ class Search:
         """Add effects while they earn it, then take away those that the others have made needless."""
         null = base = self.base()
         stages = [self.stage(null)]
-        left = _left_by(min((score.trial for score in stages[0].scores), key=lambda trial: trial.excess))
+        left = left_by(min((score.trial for score in stages[0].scores), key=lambda trial: trial.excess))
         if np.any(left > _COARSE):  # only now it is known that nothing comes near the sensors' noise
             self._tolerance = left
             null = base = self.base()
             stages = [self.stage(null)]
-        while (best := _chosen(null, base, stages[-1].scores)) is not None:
-            self._tolerance = _left_by(best.trial)
+        while (best := chosen(null, base, stages[-1].scores)) is not None:
+            self._tolerance = left_by(best.trial)
             base = self.base([*base.hypothesis.candidates, best.candidate], best.trial.fit.u)
             if len(base.hypothesis.candidates) == MOST_EFFECTS:
                 break
@@ -268,8 +144,8 @@ class Search:
         promising = screened[:REFITTED] + [s for s in screened[REFITTED:] if s.candidate in spoken_for]
         trials = self.trials(base, [_Refit(one, one.candidate in spoken_for) for one in promising])
         best = min(trials, key=lambda trial: trial.fit.loss + 0.5 * np.sum((trial.held_out / base.tolerance) ** 2))
-        worth = _worth(best)
-        scores = [_score(base, s, t, worth) for s, t in zip(promising, trials, strict=True)]
+        worth = worth_of(best)
+        scores = [score_of(base, s, t, worth) for s, t in zip(promising, trials, strict=True)]
         return Stage(base, tuple(screened), tuple(sorted(scores, key=lambda score: -score.total)))
 
     def screen(self, base: Base, candidate: Candidate) -> Screened:
@@ -344,7 +220,7 @@ class Search:
             without = self.base(others, base.hypothesis.without(effect, base.fit.u))
             screened = self.screen(without, effect)
             (with_it,) = self.trials(without, [_Refit(screened)])
-            if not _score(without, screened, with_it, _worth(with_it)).earned:
+            if not score_of(without, screened, with_it, worth_of(with_it)).earned:
                 return self._eliminated(without)
         return base
 
@@ -392,66 +268,3 @@ def _clipped(step: float, shift: Array, neutral: Array, hypothesis: Hypothesis, 
     ends = (bounds - neutral[moving]) / shift[moving]
     smallest, largest = ends.min(axis=0).max(initial=-_FURTHEST), ends.max(axis=0).min(initial=_FURTHEST)
     return float(np.clip(step, smallest, largest))
-
-
-def _chosen(null: Base, base: Base, scores: Sequence[Score]) -> Score | None:
-    """The candidate to add: the simplest of those that the best does not beat both in the fit and on held-out data.
-
-    A law of slightly another form than the true one leaves an error that nothing in the library describes, but much of
-    it bends a little. So a further effect must make the model right, to what noise is, or explain a share of what the
-    ones before it did. Where even the best leaves more than noise, a simpler one that takes nearly as much is as good.
-    """
-    earned = [score for score in scores if score.earned]
-    if base is not null:
-        right, least = EXPLAINED - 1, FURTHER * (null.excess - base.excess)
-        earned = [
-            s
-            for s in earned
-            if base.excess > right > s.trial.excess or base.excess - s.trial.excess > least or s.of_prior > 0.5 * FAR**2
-        ]
-    if not earned:
-        return None
-    best = earned[0]
-    enough = base.excess - SIMPLER_SHARE * (base.excess - best.trial.excess)
-    as_good = [
-        s
-        for s in earned
-        if best.fitted - s.fitted < SIMPLER
-        or best.held_out - s.held_out < SIMPLER
-        or enough > s.trial.excess > best.trial.excess > EXPLAINED - 1
-    ]
-    return min(as_good, key=lambda score: (len(score.trial.fit.u), -score.total))
-
-
-def _worth(best: Trial) -> Array:
-    """What a squared error of 1 is worth in each channel, (c,): 1 where the best model leaves noise alone.
-
-    Where it leaves more, the errors are larger than the noise and go together within a window: that many fewer count.
-    """
-    errors = best.held_out
-    mean_square = np.mean(errors**2, axis=(0, 1))
-    of_means = np.mean(errors.mean(axis=1) ** 2, axis=0)
-    alike = np.clip(errors.shape[1] * of_means / np.maximum(mean_square, 1e-12), 1.0, errors.shape[1])
-    return 1 / np.maximum(mean_square * np.where(mean_square > EXPLAINED, alike, 1.0), 1.0)
-
-
-def _left_by(best: Trial) -> Array:
-    """The errors that a model leaves, in units of the sensors' noise, (c,), each counted by what it is worth."""
-    return 1 / np.sqrt(_worth(best))
-
-
-def _score(base: Base, screened: Screened, trial: Trial, worth: Array) -> Score:
-    """Gains in nats, each squared error counted by what it is worth."""
-
-    def gain(before: Array, after: Array) -> float:
-        return 0.5 * float(np.sum(worth * (np.sum(before**2, axis=(0, 1)) - np.sum(after**2, axis=(0, 1)))))
-
-    def prior(fit: Fit) -> float:
-        return 0.5 * float(np.sum((fit.u / fit.prior_std) ** 2))
-
-    added = len(trial.fit.u) - len(base.fit.u)
-    price = 0.5 * added * np.log(base.fit.errors.size)
-    of_prior = prior(base.fit) - prior(trial.fit)
-    fitted = gain(base.tolerance * base.fit.errors, base.tolerance * trial.fit.errors) + of_prior - price
-    held_out = gain(base.held_out, trial.held_out) + of_prior
-    return Score(screened, trial, float(fitted), float(held_out), of_prior)

@@ -21,7 +21,8 @@ from simopt_envs.gap.excitations import excitations
 from simopt_envs.gap.fit import Fit, Misfit
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
 from simopt_envs.gap.result import Named
-from simopt_envs.gap.search import Base, Data, Explanation
+from simopt_envs.gap.search import Explanation
+from simopt_envs.gap.trial import Base, Data
 from simopt_envs.measured.recording import Recording
 from simopt_envs.measured.windows import Windows, cut_windows
 from simopt_envs.physics.effects.actuator_delay import LONGEST

@@ -1,0 +1,121 @@
+"""Which candidate earns its place: evidence in what was fitted and in what was held out, and a taste for the simple."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from simopt_envs.gap.fit import Fit
+from simopt_envs.gap.hypothesis import Candidate
+from simopt_envs.gap.plain import SPEAKS_FOR
+from simopt_envs.gap.thresholds import EVIDENCE, EXPLAINED, FAR, FURTHER, SIMPLER, SIMPLER_SHARE
+from simopt_envs.gap.trial import Base, Screened, Trial
+from simopt_envs.physics.parameters import Array
+
+
+@dataclass(frozen=True)
+class Score:
+    """What a candidate earns over the base, in nats.
+
+    Attributes:
+        screened: by the linear screen.
+        trial: its fit.
+        fitted: gain on the fitted windows and the prior, less the price of its parameters (BIC).
+        held_out: gain on the windows held out and the prior.
+        of_prior: the part of both that plain parameters give back, as they need not stand in for the effect any more.
+    """
+
+    screened: Screened
+    trial: Trial
+    fitted: float
+    held_out: float
+    of_prior: float
+
+    @property
+    def candidate(self) -> Candidate:
+        """The effect and its place."""
+        return self.screened.candidate
+
+    @property
+    def total(self) -> float:
+        """By which candidates are ranked."""
+        return self.fitted + self.held_out
+
+    @property
+    def earned(self) -> bool:
+        """Whether it may be called missing: it must show in what was fitted, and in recordings that no fit saw.
+
+        Less is asked of an effect that plain parameters can stand in for: all it can show is how far they had to go.
+        """
+        stood_in_for = self.candidate.effect.name in SPEAKS_FOR.values() and self.of_prior > 0.5 * FAR**2
+        least = 0.0 if stood_in_for else EVIDENCE
+        return (
+            self.fitted > least
+            and self.held_out > least
+            and self.trial.hypothesis.is_itself(self.candidate, self.trial.fit.u)
+        )
+
+
+def chosen(null: Base, base: Base, scores: Sequence[Score]) -> Score | None:
+    """The candidate to add: the simplest of those that the best does not beat both in the fit and on held-out data.
+
+    A law of slightly another form than the true one leaves an error that nothing in the library describes, but much of
+    it bends a little. So a further effect must make the model right, to what noise is, or explain a share of what the
+    ones before it did. Where even the best leaves more than noise, a simpler one that takes nearly as much is as good.
+    """
+    earned = [score for score in scores if score.earned]
+    if base is not null:
+        right, least = EXPLAINED - 1, FURTHER * (null.excess - base.excess)
+        earned = [
+            s
+            for s in earned
+            if base.excess > right > s.trial.excess or base.excess - s.trial.excess > least or s.of_prior > 0.5 * FAR**2
+        ]
+    if not earned:
+        return None
+    best = earned[0]
+    enough = base.excess - SIMPLER_SHARE * (base.excess - best.trial.excess)
+    as_good = [
+        s
+        for s in earned
+        if best.fitted - s.fitted < SIMPLER
+        or best.held_out - s.held_out < SIMPLER
+        or enough > s.trial.excess > best.trial.excess > EXPLAINED - 1
+    ]
+    return min(as_good, key=lambda score: (len(score.trial.fit.u), -score.total))
+
+
+def worth_of(best: Trial) -> Array:
+    """What a squared error of 1 is worth in each channel, (c,): 1 where the best model leaves noise alone.
+
+    Where it leaves more, the errors are larger than the noise and go together within a window: that many fewer count.
+    """
+    errors = best.held_out
+    mean_square = np.mean(errors**2, axis=(0, 1))
+    of_means = np.mean(errors.mean(axis=1) ** 2, axis=0)
+    alike = np.clip(errors.shape[1] * of_means / np.maximum(mean_square, 1e-12), 1.0, errors.shape[1])
+    return 1 / np.maximum(mean_square * np.where(mean_square > EXPLAINED, alike, 1.0), 1.0)
+
+
+def left_by(best: Trial) -> Array:
+    """The errors that a model leaves, in units of the sensors' noise, (c,), each counted by what it is worth."""
+    return 1 / np.sqrt(worth_of(best))
+
+
+def score_of(base: Base, screened: Screened, trial: Trial, worth: Array) -> Score:
+    """Gains in nats, each squared error counted by what it is worth."""
+
+    def gain(before: Array, after: Array) -> float:
+        return 0.5 * float(np.sum(worth * (np.sum(before**2, axis=(0, 1)) - np.sum(after**2, axis=(0, 1)))))
+
+    def prior(fit: Fit) -> float:
+        return 0.5 * float(np.sum((fit.u / fit.prior_std) ** 2))
+
+    added = len(trial.fit.u) - len(base.fit.u)
+    price = 0.5 * added * np.log(base.fit.errors.size)
+    of_prior = prior(base.fit) - prior(trial.fit)
+    fitted = gain(base.tolerance * base.fit.errors, base.tolerance * trial.fit.errors) + of_prior - price
+    held_out = gain(base.held_out, trial.held_out) + of_prior
+    return Score(screened, trial, float(fitted), float(held_out), of_prior)

@@ -1,0 +1,95 @@
+"""What a search compares: hypotheses fitted to windows, and what they say of windows that no fit saw."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from simopt_envs.adaptation.fitting import Noise
+from simopt_envs.gap.fit import Fit
+from simopt_envs.gap.hypothesis import Candidate, Hypothesis
+from simopt_envs.measured.recording import Finding, Recording
+from simopt_envs.measured.windows import Windows
+from simopt_envs.physics.parameters import Array
+
+
+@dataclass(frozen=True)
+class Data:
+    """Windows of recordings to fit, and of recordings that no fit sees.
+
+    Attributes:
+        fitted, held_out: the windows.
+        fitted_recordings, held_out_recordings: what they are cut from.
+        warnings: of the recordings' audit.
+    """
+
+    fitted: Windows
+    held_out: Windows
+    fitted_recordings: tuple[Recording, ...]
+    held_out_recordings: tuple[Recording, ...]
+    warnings: tuple[Finding, ...] = ()
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A hypothesis fitted, and what it says of the recordings that were held out.
+
+    Attributes:
+        hypothesis: plain parameters and effects.
+        fit: of the fitted windows.
+        held_out: whitened errors there, in units of the sensors' noise, (w, S, c).
+    """
+
+    hypothesis: Hypothesis
+    fit: Fit
+    held_out: Array
+
+    @property
+    def excess(self) -> float:
+        """Mean square of the whitened held-out errors above that of noise alone, which is 1."""
+        return float(np.mean(self.held_out**2)) - 1.0
+
+
+@dataclass(frozen=True)
+class Base(Trial):
+    """A trial that others are compared with, and the noise they are all fitted in.
+
+    Attributes:
+        noise, held_out_noise: at its ξ.
+        tolerance: how many times the sensors' noise that noise is, (c,): what even the best model leaves, where it
+            leaves more. Fits in units of less would count priors for nothing.
+    """
+
+    noise: Noise
+    held_out_noise: Noise
+    tolerance: Array
+
+    @property
+    def sensor_noise(self) -> Array:
+        """Standard deviation of each channel's noise, (c,)."""
+        return self.noise.scale / self.tolerance
+
+    @property
+    def whitened(self) -> tuple[Array, Array]:
+        """Errors fitted and held out, in units of the sensors' noise, (w, S, c)."""
+        return self.tolerance * self.fit.errors, self.held_out
+
+
+@dataclass(frozen=True)
+class Screened:
+    """A candidate that acts linearly.
+
+    Attributes:
+        candidate: the effect and its place.
+        hypothesis: the base's with the candidate.
+        direction: what its best probe changes in the base's residual, plain parameters projected out, (m,).
+        gain: in -log p, of the best multiple of that probe.
+        starts: u from which a fit may start, (k, d).
+    """
+
+    candidate: Candidate
+    hypothesis: Hypothesis
+    direction: Array
+    gain: float
+    starts: Array
