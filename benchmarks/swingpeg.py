@@ -74,12 +74,14 @@ def make_vector_env(num_envs: int, widening: float = 1.0) -> VectorEnv:
 
 
 def success(policy: TorchPolicy, parameters: Array, seed: int) -> NDArray[np.bool_]:
-    """Whether an episode with each ξ (n, d) ends in success, (n,)."""
-    env = gym.make_vec(ENV_ID, num_envs=len(parameters), autoreset_mode=AutoresetMode.DISABLED)
+    """Whether an episode with each ξ (n, d) ends in success, (n,); one that diverges does not."""
+    env = gym.make_vec(ENV_ID, num_envs=len(parameters), autoreset_mode=AutoresetMode.NEXT_STEP)
     observation, _ = env.reset(seed=seed, options={"parameters": parameters})
+    diverged = np.zeros(len(parameters), dtype=bool)
     for _ in range(HORIZON):
         observation, *_, info = env.step(policy.act(observation))
-    return info["is_success"]
+        diverged |= info["diverged"]
+    return info["is_success"] & ~diverged
 
 
 def train(args: Args) -> tuple[TorchPolicy, dict[str, float]]:
