@@ -149,13 +149,13 @@ def success_curves(policy: TorchPolicy, env: TaskEnv, args: Args) -> dict[str, t
 def curves_figure(curves: Mapping[str, tuple[Array, Array]], space: ParameterSpace) -> Figure:
     """A panel for each parameter: success over its bounds, a line at its nominal value."""
     rows = -(-len(curves) // COLUMNS)
-    figure = Figure(figsize=(11.0, 1.5 * rows), layout="constrained")
+    figure = Figure(figsize=(11.0, 1.7 * rows), layout="constrained")
     panels = figure.subplots(rows, COLUMNS, sharey=True, squeeze=False).flat
     for (name, (values, rates)), axis in zip(curves.items(), panels, strict=False):
         parameter = space[name]
         axis.axvline(parameter.nominal, color=GREY, linewidth=0.8, linestyle=":")
         axis.plot(values, rates, color=BLUE, marker=".")
-        axis.set_title(name if parameter.unit == "1" else f"{name} [{parameter.unit}]", size=8)
+        axis.set_title(name if parameter.unit == "1" else f"{name}\n[{parameter.unit}]", size=8)
         axis.set_xscale(parameter.coordinate)
         axis.set_xticks(values[[0, -1]], [f"{value:.3g}" for value in values[[0, -1]]])
         axis.minorticks_off()
