@@ -15,7 +15,7 @@ test: $(VENV) $(ROBOTICS)
 test-slow: $(VENV)
 	.venv/bin/python -m pytest -m slow
 
-# The paper's questions: hours; the quick ones a quarter of an hour. Both go on where they were stopped.
+# The paper's questions: hours; the quick ones are fewer seeds and conditions. Both go on where they were stopped.
 experiments: $(VENV)
 	.venv/bin/python -m baselines.experiments
 

@@ -92,7 +92,7 @@ class PPOConfig:
     """Logarithm of the exploration noise at the start, where the action range is ±1."""
     stuck_iterations: int = 15
     """A training that continues from a given policy starts from scratch if no episode of the first so many iterations
-    succeeds: with its little exploration noise it will not find out how, and new weights do in a minute."""
+    succeeds: with its little exploration noise it will not find out how, and new weights do in a minute or two."""
     success_stop: float | None = 0.97
     """Training ends early at this success rate (mean of `info["is_success"]` at episode ends, where the env has it)."""
     evaluation_share: float = 0.125

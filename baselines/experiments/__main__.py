@@ -30,7 +30,7 @@ class Experiments:
     questions: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[QUESTION ...]")] = ()
     """Some of randomization, learned_distribution, iterations, robots, update_rules, ablations; all by default."""
     quick: bool = False
-    """Only a part: fewer seeds and conditions, a quarter of an hour on two cores for all questions."""
+    """Only a part: fewer seeds and conditions."""
     out: Path = Path("out/experiments")
     """Folder for results, policies and runs of SimOpt. The machines of a Ray cluster must share it."""
     docs: Path = Path("docs/experiments")

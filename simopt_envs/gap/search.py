@@ -17,7 +17,7 @@ from simopt_envs.gap.hypothesis import Candidate, Hypothesis
 from simopt_envs.gap.kept import kept_fits, key_of
 from simopt_envs.gap.plain import SPEAKS_FOR, Plain
 from simopt_envs.gap.selection import Score, chosen, left_by, score_of, worth_of
-from simopt_envs.gap.thresholds import FAR, MOST_EFFECTS, REFITTED
+from simopt_envs.gap.thresholds import COARSE, FAR, MOST_EFFECTS, REFITTED
 from simopt_envs.gap.trial import Base, Data, Screened, Trial
 from simopt_envs.measured.windows import Windows
 from simopt_envs.physics.effects import Motion
@@ -31,7 +31,6 @@ _STEPS = np.array([1.0, 0.3, 0.1, 0.03])  # shares of the screen's step that a f
 _WORTH_A_START = 0.2  # share of the best probe's gain at which a fit may start from another one
 _SIZES = np.array([-30.0, -10.0, -3.0, -1.0, 1.0, 3.0, 10.0, 30.0])  # probes, of an effect that is spoken for
 _FURTHEST = 20.0  # probes that the screen's step may be long
-_COARSE = 3.0  # times the sensors' noise, from which what a model leaves decides what a fit counts errors in
 
 
 @dataclass(frozen=True)
@@ -103,7 +102,7 @@ class Search:
         null = base = self.base()
         stages = [self.stage(null)]
         left = left_by(min((score.trial for score in stages[0].scores), key=lambda trial: trial.excess))
-        if np.any(left > _COARSE):  # only now it is known that nothing comes near the sensors' noise
+        if np.any(left > COARSE):  # only now it is known that nothing comes near the sensors' noise
             self._tolerance = left
             null = base = self.base()
             stages = [self.stage(null)]

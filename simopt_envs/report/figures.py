@@ -117,7 +117,7 @@ def parameters_figure(run: Run) -> Figure:
         axis.plot(k, median[:, i], "o-", color=BLUE, label="median of p(ξ)")
         if run.truth is not None:
             axis.axhline(run.truth[i], color=ORANGE, linestyle="--", label="hidden truth")
-        axis.set_title(run.labels[i])
+        axis.set_title(run.labels[i].replace(" [", "\n["), size=8)  # on one line, long names run into the next panel
         axis.xaxis.set_major_locator(MaxNLocator(integer=True))
         axis.yaxis.set_major_locator(MaxNLocator(4))
     for axis in panels[len(run.names) :]:
