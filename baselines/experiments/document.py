@@ -80,17 +80,18 @@ def write_document(question: Question, store: Store, docs: Path) -> Path | None:
 
 
 def _made(question: Question, cells: list[Cell], results: Results, store: Store) -> str:
-    missing = [cell for cell in cells if cell.seed not in results.get(cell.condition, {})]
-    finished = len(cells) - len(missing)
-    quick = " --quick" if missing and all(not cell.quick for cell in missing) else ""
+    finished = [cell for cell in cells if cell.seed in results.get(cell.condition, {})]
+    quick = " --quick" if all(cell.quick for cell in finished) else ""
+    minutes = store.seconds(cells) / 60
+    took = f"{minutes:.0f} min" if minutes < 100 else f"{minutes / 60:.1f} h"
     seeds = sorted({seed for of_seed in results.values() for seed in of_seed})
     lines = [
-        f"`python -m baselines.experiments {question.name}{quick}`; seeds {', '.join(map(str, seeds))}; {finished} of"
-        f" {len(cells)} cells, which took {store.seconds(cells) / 3600:.1f} h in all.",
+        f"`python -m baselines.experiments {question.name}{quick}`; seeds {', '.join(map(str, seeds))};"
+        f" {len(finished)} of {len(cells)} cells, which took {took} in all.",
         "Square brackets hold 95 % intervals: of the seeds by bootstrap, for success also of the episodes it was"
         " counted over. The interval of a success that has one seed only is that of its episodes.",
     ]
-    if missing:
-        conditions = dict.fromkeys(cell.condition for cell in missing if cell.condition not in results)
+    if len(finished) < len(cells):
+        conditions = dict.fromkeys(cell.condition for cell in cells if cell.condition not in results)
         lines.append(f"Not run yet: {', '.join(conditions) or 'some seeds'}.")
     return "\n\n".join(lines)

@@ -14,7 +14,7 @@ from baselines.experiments.drawing import as_percent, draw_points, style
 from baselines.experiments.environments import DRAWER, PEG, Randomization
 from baselines.experiments.settings import Instance, Train
 from baselines.experiments.statistics import Estimate, mean_of, success_of
-from baselines.experiments.targets import PEG_TARGETS, SHIFTS, drawer, drawer_cure, peg, peg_cure
+from baselines.experiments.targets import PEG_TARGETS, QUICK_SEEDS, SHIFTS, drawer, drawer_cure, peg, peg_cure
 
 _NAME = "randomization"
 _SEEDS = range(5)
@@ -76,7 +76,7 @@ def _cells() -> list[Cell]:
             for seed in _SEEDS:
                 quick = target == "22 cm" and seed == 0
                 cells.append(Cell(_NAME, condition(task, "oracle", target), seed, oracle, quick))
-                quick = target in FAR["drawer"] and seed < 2
+                quick = seed < QUICK_SEEDS.get(target, 0)
                 cells.append(Cell(_NAME, condition(task, "SimOpt", target), seed, cure, quick))
         start = "x 10 cm" if task == "drawer" else START[task]
         instance = Instance(fixed[WIDEST[task]], fixed[start])

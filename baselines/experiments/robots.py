@@ -34,7 +34,7 @@ class _Robot:
 
 
 _ROBOTS: Mapping[str, _Robot] = {
-    "drawer": _Robot("drawer", "Franka Panda", "cabinet 22 cm off", drawer_cure("22 cm"), "5 (simulated)", 2),
+    "drawer": _Robot("drawer", "Franka Panda", "cabinet 22 cm off", drawer_cure("22 cm"), "5 (simulated)", 1),
     "peg": _Robot("swing-peg", "ABB YuMi", "rope, peg and arm", peg_cure("far"), "2 (real, 18 of 20)"),
     "pendulum": _Robot("`InvertedPendulum-v5`", "cart", "motor six times as strong", pendulum_cure(), quick_seeds=1),
 }
