@@ -86,7 +86,7 @@ def test_errors_with_their_noise_floor(tmp_path, values):
 
 
 def test_candidates_and_curve(tmp_path):
-    figure = candidates_figure(["one", "two"], [500.0, -3.0], [80.0, -50.0], 20.0)
+    figure = candidates_figure(["one", "two"], [500.0, -3.0], [80.0, -50.0], 5.0, 20.0)
     assert [bar.get_width() for bar in figure.axes[0].patches] == [500.0, -3.0, 80.0, -50.0]
     assert save_figure(figure, tmp_path / "candidates.png").exists()
     x = np.linspace(-1, 1, 30)

@@ -158,14 +158,17 @@ def error_figure(values: Sequence[float], intervals: Sequence[tuple[float, float
 
 
 @styled
-def candidates_figure(names: Sequence[str], fitted: Sequence[float], held_out: Sequence[float], least: float) -> Figure:
+def candidates_figure(
+    names: Sequence[str], fitted: Sequence[float], held_out: Sequence[float], each: float, in_all: float
+) -> Figure:
     """What each candidate gains, in nats, best first, against what it must gain to be called missing.
 
     Args:
         names: of the candidates.
         fitted: gains on the fitted windows, less the price of the parameters.
         held_out: gains on windows that no fit saw.
-        least: threshold of both.
+        each: threshold of either.
+        in_all: threshold of their sum.
     """
     at = np.arange(len(names))
     figure = Figure(figsize=(_WIDTH, 0.9 + 0.42 * len(names)), layout="constrained")
@@ -174,11 +177,11 @@ def candidates_figure(names: Sequence[str], fitted: Sequence[float], held_out: S
     axis.barh(
         at + 0.19, held_out, height=0.36, color=ORANGE, label="held-out recordings", hatch="///", edgecolor="white"
     )
-    axis.axvline(least, color=INK, linestyle="--", linewidth=1.0, label=f"needed in both: {least:g}")
+    axis.axvline(each, color=INK, linestyle="--", linewidth=1.0, label=f"needed: {each:g} in each, {in_all:g} in all")
     axis.axvline(0, color=INK, linewidth=0.6)
-    axis.set_xscale("symlog", linthresh=least)
+    axis.set_xscale("symlog", linthresh=in_all)
     axis.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
-    axis.set_xlim(min(0.0, 2 * min(*fitted, *held_out)), 3 * max(*fitted, *held_out, least))
+    axis.set_xlim(min(0.0, 2 * min(*fitted, *held_out)), 3 * max(*fitted, *held_out, in_all))
     axis.set_yticks(at, names)
     axis.invert_yaxis()
     axis.grid(visible=False, axis="y")

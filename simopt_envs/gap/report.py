@@ -177,7 +177,7 @@ def candidates(gap: Gap, plots: _Plots) -> Iterator[Section]:
     yield plots.section(
         "Candidates",
         "candidates",
-        candidates_figure(names, fitted, held_out, thresholds.EVIDENCE),
+        candidates_figure(names, fitted, held_out, thresholds.EVIDENCE_EACH, thresholds.EVIDENCE),
         "The best of the whole library, each alone fitted together with all plain parameters: what it gains over the "
         "refitted model, less the price of its parameters on the fitted recordings.",
     )

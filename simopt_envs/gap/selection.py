@@ -10,7 +10,7 @@ import numpy as np
 from simopt_envs.gap.fit import Fit
 from simopt_envs.gap.hypothesis import Candidate
 from simopt_envs.gap.plain import SPEAKS_FOR
-from simopt_envs.gap.thresholds import EVIDENCE, EXPLAINED, FAR, FURTHER, SIMPLER, SIMPLER_SHARE
+from simopt_envs.gap.thresholds import EVIDENCE, EVIDENCE_EACH, EXPLAINED, FAR, FURTHER, SIMPLER, SIMPLER_SHARE
 from simopt_envs.gap.trial import Base, Screened, Trial
 from simopt_envs.physics.parameters import Array
 
@@ -50,16 +50,16 @@ class Score:
         Less is asked of an effect that plain parameters can stand in for: all it can show is how far they had to go.
         """
         stood_in_for = self.candidate.effect.name in SPEAKS_FOR.values() and self.of_prior > 0.5 * FAR**2
-        least = 0.0 if stood_in_for else EVIDENCE
+        least, in_all = (0.0, 0.0) if stood_in_for else (EVIDENCE_EACH, EVIDENCE)
         return (
-            self.fitted > least
-            and self.held_out > least
+            min(self.fitted, self.held_out) > least
+            and self.total > in_all
             and self.trial.hypothesis.is_itself(self.candidate, self.trial.fit.u)
         )
 
 
 def chosen(null: Base, base: Base, scores: Sequence[Score]) -> Score | None:
-    """The candidate to add: the simplest of those that the best does not beat both in the fit and on held-out data.
+    """The candidate to add: the simplest of those that the best does not beat clearly on held-out data.
 
     A law of slightly another form than the true one leaves an error that nothing in the library describes, but much of
     it bends a little. So a further effect must make the model right, to what noise is, or explain a share of what the
@@ -80,8 +80,8 @@ def chosen(null: Base, base: Base, scores: Sequence[Score]) -> Score | None:
     as_good = [
         s
         for s in earned
-        if best.fitted - s.fitted < SIMPLER
-        or best.held_out - s.held_out < SIMPLER
+        if best.held_out - s.held_out < SIMPLER
+        or best.total - s.total < SIMPLER
         or enough > s.trial.excess > best.trial.excess > EXPLAINED - 1
     ]
     return min(as_good, key=lambda score: (len(score.trial.fit.u), -score.total))

@@ -5,14 +5,17 @@ were first run. Changed since, with recordings of real hardware and development 
 ``COARSE`` are new, and ``FURTHER`` holds for every further effect, not only where the model counts as right.
 """
 
-EVIDENCE = 15.0
-"""Nats that an effect must earn both on the windows fitted and on those held out."""
+EVIDENCE = 20.0
+"""Nats that an effect must earn on the windows fitted and on those held out together."""
+
+EVIDENCE_EACH = 5.0
+"""Nats that it must earn on either."""
 
 EXPLAINED = 1.25
 """Mean square of the whitened errors up to which a model counts as right; noise alone leaves 1."""
 
 SIMPLER = 5.0
-"""Nats by which a candidate with more parameters must win, both fitted and held out, over one with fewer."""
+"""Nats by which a candidate with more parameters must win, held out and in all, over one with fewer."""
 
 SIMPLER_SHARE = 0.8
 """Share of what the best takes from the held-out excess at which a candidate with fewer parameters is as good, where
