@@ -94,6 +94,18 @@ def test_the_files_say_what_the_contract_promises(friction_gap, tmp_path):
     assert held_out[0] == max(held_out)
 
 
+def test_a_sensor_that_was_not_recorded_is_no_candidate():
+    recordings = record(lambda q, v: np.zeros(2), np.random.default_rng(5), count=2, seconds=1.0)
+    joints = [replace(r, columns={n: v for n, v in r.columns.items() if not n.startswith("site")}) for r in recordings]
+
+    def tried(data):
+        gap = find_gap(spec(), data, effects=[EFFECTS["sensor_delay"]])
+        return {screened.candidate.place for screened in gap.explanation.stages[0].screened}
+
+    assert tried(joints) == {"joint:shoulder", "joint:elbow"}
+    assert tried(recordings) == {"joint:shoulder", "joint:elbow", "site:tip"}
+
+
 def test_what_cannot_be_searched_is_said_before_any_work():
     recordings = record(lambda q, v: np.zeros(2), np.random.default_rng(4), count=2, seconds=1.0)
     with pytest.raises(ValueError, match="at least one recording"):

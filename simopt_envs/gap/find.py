@@ -28,6 +28,7 @@ from simopt_envs.measured.readers import load_recordings
 from simopt_envs.measured.recording import Recording
 from simopt_envs.measured.windows import Windows
 from simopt_envs.physics.effects import EFFECTS, Effect, require_mujoco
+from simopt_envs.physics.effects.readings import columns
 
 _SEED = 0  # of the bootstrap
 
@@ -74,7 +75,7 @@ def find_gap(
     ]
     data = read_windows(start.model, read, keyframe)
     motion = motion_of(start.model, read, keyframe)
-    seen = tuple(c for effect in effects for c in _places(effect, start.model) if _shows(c, data.fitted))
+    seen = tuple(c for effect in effects for c in _places(effect, start.model) if _shows(c, start.model, data.fitted))
     explanation = Search(start, data, motion, seen, progress, engine, directory).run()
     return _gap(given, explanation, data, keyframe, began)
 
@@ -111,9 +112,6 @@ def _places(effect: Effect, model: mujoco.MjModel) -> list[Candidate]:
     return [Candidate(effect, place) for place in effect.places(model)]
 
 
-def _shows(candidate: Candidate, windows: Windows) -> bool:
-    """Whether a candidate that acts on what sensors show alone acts on a column that there is."""
-    kind, _, name = candidate.place.partition(":")
-    if kind in ("site", "sensor"):
-        return any(column.startswith(f"{kind}/{name}") for column in windows.names)
-    return True
+def _shows(candidate: Candidate, model: mujoco.MjModel, windows: Windows) -> bool:
+    """Whether a candidate that acts on what a sensor shows acts on a column that there is."""
+    return not candidate.effect.of_reading or not set(columns(model, candidate.place)).isdisjoint(windows.names)

@@ -20,6 +20,7 @@ class SensorBias(Effect):
 
     name = "sensor_bias"
     law = "y = x + b"
+    of_reading = True
 
     def places(self, model: mujoco.MjModel) -> tuple[str, ...]:
         """See :meth:`Effect.places`."""

@@ -15,6 +15,7 @@ class SensorDelay(Effect):
 
     name = "sensor_delay"
     law = "y(t) = x(t - T)"
+    of_reading = True
 
     def places(self, model: mujoco.MjModel) -> tuple[str, ...]:
         """See :meth:`Effect.places`."""

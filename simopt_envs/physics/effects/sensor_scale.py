@@ -15,6 +15,7 @@ class SensorScale(Effect):
 
     name = "sensor_scale"
     law = "y = s x"
+    of_reading = True
 
     def places(self, model: mujoco.MjModel) -> tuple[str, ...]:
         """See :meth:`Effect.places`."""
