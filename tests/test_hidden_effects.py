@@ -14,7 +14,7 @@ from benchmarks.hidden_effects.detectability import reduced
 from benchmarks.hidden_effects.generate import column_names, simulate, write_case
 from benchmarks.hidden_effects.outside import OUTSIDE
 from benchmarks.hidden_effects.plants import RECORDINGS, nominal_model, plants
-from benchmarks.hidden_effects.score import Answer, Rate, confusion, magnitude_errors, rates
+from benchmarks.hidden_effects.score import Answer, Rate, confusion, magnitude_errors, plant_table, rates
 from benchmarks.hidden_effects.truth import HALF_STEP_LEAD, TIMESTEP, World, delayed
 
 pytestmark = needs_effects
@@ -163,6 +163,7 @@ def answer(kind, hidden, verdict, named, value=1.0):
 
     label = {
         "case": "x",
+        "plant": "two_link",
         "kind": kind,
         "effects": [effect(name, 1.0) for name in hidden],
         "ratio": 10.0,
@@ -170,7 +171,7 @@ def answer(kind, hidden, verdict, named, value=1.0):
         "equivalents": ["payload@body:a"] if kind == "single" else [],
     }
     found = [effect(name, {"value": value, "unit": "N", "interval95": [value - 0.1, value + 0.1]}) for name in named]
-    gap = {"refit": 2.0, "after": 1.1, "noise_floor": 1.0}
+    gap = {"whitened": {"refit": 2.0, "after": 1.1}}
     return Answer(label, {"verdict": verdict, "effects": found, "candidates": [], "gap": gap})
 
 
@@ -211,6 +212,18 @@ def test_the_score_of_right_answers_is_full_and_of_wrong_ones_empty():
     assert right["95 % intervals that hold the truth (same form)"] == (3, 3)
     assert wrong["95 % intervals that hold the truth (same form)"] == (1, 2)
     assert right["excess gap removed by 80 % or more, when named"] == (2, 2)
+
+
+def test_counts_by_plant():
+    friction, drag = "coulomb_friction@joint:a", "quadratic_drag@joint:a"
+    answers = [
+        answer("single", [friction], "named", [friction]),
+        answer("single", [friction], "named", [drag]),
+        answer("null", [], "none", []),
+        answer("outside", ["crosstalk@joint:a"], "unexplained", []),
+        answer("double", [friction, drag], "named", [drag]),
+    ]
+    assert plant_table(answers)[-1] == "| two_link | 1 of 2 | 0 of 0 | 1 of 2 | 0 of 1 | 1 of 1 | 0 of 1 |"
 
 
 def test_magnitude_errors_and_confusion_count_what_they_say():

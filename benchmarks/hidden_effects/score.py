@@ -80,10 +80,13 @@ class Answer:
         return [(effect, by_name[_name(effect)]) for effect in self.label["effects"] if _name(effect) in by_name]
 
     def excess_removed(self) -> float | None:
-        """Share that the repair removed of the refit's gap above the noise floor; None where there is no such gap."""
-        gap = self.gap["gap"]
-        excess = gap["refit"] - gap["noise_floor"]
-        return None if excess <= 0 else float(1 - (gap["after"] - gap["noise_floor"]) / excess)
+        """Share that the repair removed of the refit's gap above the noise; None where there is no such gap.
+
+        A gap is the mean square of the held-out errors in units of the noise of sensors and of estimated starts.
+        """
+        gap = self.gap["gap"]["whitened"]
+        excess = gap["refit"] - 1.0
+        return None if excess <= 0 else float(1 - (gap["after"] - 1.0) / excess)
 
 
 def _name(effect: dict[str, Any]) -> str:
@@ -140,14 +143,44 @@ def rate(name: str, answers: Sequence[Answer], hit: Callable[[Answer], bool]) ->
     return Rate(name, sum(map(hit, answers)), len(answers))
 
 
-def rates(answers: Iterable[Answer]) -> list[Rate]:
-    """All rates."""
+def by_kind_of(answers: Iterable[Answer]) -> dict[str, list[Answer]]:
+    """Answers by the kind of their case."""
     by_kind: dict[str, list[Answer]] = {"single": [], "null": [], "outside": [], "double": []}
     for answer in answers:
         by_kind[answer.label["kind"]].append(answer)
-    singles = [a for a in by_kind["single"] if a.label["detectable"]]
-    large = [a for a in singles if a.label["ratio"] > 5]
-    small = [a for a in singles if a.label["ratio"] <= 5]
+    return by_kind
+
+
+def by_level(answers: Iterable[Answer]) -> tuple[list[Answer], list[Answer]]:
+    """Single effects that can be detected, of about 10 and of about 3 times the least detectable magnitude."""
+    singles = [a for a in by_kind_of(answers)["single"] if a.label["detectable"]]
+    return [a for a in singles if a.label["ratio"] > 5], [a for a in singles if a.label["ratio"] <= 5]
+
+
+def plant_table(answers: Sequence[Answer]) -> list[str]:
+    """The most important counts by plant, as a Markdown table."""
+    lines = ["| plant | 10 x, named first | 3 x | wrong first | nulls that alarm | outside, not claimed | pairs |"]
+    lines.append("|---|---|---|---|---|---|---|")
+    for plant in dict.fromkeys(a.label["plant"] for a in answers):
+        mine = [a for a in answers if a.label["plant"] == plant]
+        (large, small), kinds = by_level(mine), by_kind_of(mine)
+        counts = [
+            rate("", large, lambda a: a.first_right),
+            rate("", small, lambda a: a.first_right),
+            rate("", [*large, *small], lambda a: bool(a.named) and not a.first_right),
+            rate("", kinds["null"], lambda a: a.noticed),
+            rate("", kinds["outside"], lambda a: not _claims(a)),
+            rate("", kinds["double"], lambda a: a.all_named),
+        ]
+        lines.append(f"| {plant} | {' | '.join(f'{c.hits} of {c.of}' for c in counts)} |")
+    return lines
+
+
+def rates(answers: Iterable[Answer]) -> list[Rate]:
+    """All rates."""
+    answers = list(answers)
+    by_kind, (large, small) = by_kind_of(answers), by_level(answers)
+    singles = [*large, *small]
     same_form = [
         (true, named)
         for answer in (*singles, *by_kind["double"])
@@ -277,6 +310,7 @@ def main() -> None:
                   f"  ->  {a.gap['verdict']}: {given}")  # fmt: skip
     results = rates(answers)
     print("\n".join(map(str, results)))
+    print("\n".join(["", *plant_table(answers), ""]))
     errors = magnitude_errors(answers)
     print(f"magnitude error, same form: {_median(errors[True])}")
     print(f"magnitude error, other form: {_median(errors[False])}")

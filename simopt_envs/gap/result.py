@@ -139,6 +139,10 @@ class Gap:
                 "after": self.errors.after,
                 "interval95": list(self.errors.interval95),
                 "noise_floor": self.errors.noise_floor,
+                "whitened": {  # mean square in units of the noise of sensors and starts, which alone leaves 1
+                    "refit": 1.0 + self.explanation.null.excess,
+                    "after": 1.0 + self.explanation.final.excess,
+                },
                 "held_out": [recording.name for recording in self.data.held_out_recordings],
             },
             "localisation": [
