@@ -23,6 +23,8 @@ from benchmarks.hidden_effects.catalogue import EFFECTS
 ANSWERS = (*EFFECTS, "none", "unexplained")
 SCALES_FROM_ONE = ("scale",)
 """Parameters whose neutral value is 1: their error is relative to the distance from that."""
+SIGNLESS = ("amplitude",)
+"""Parameters whose sign can be turned by a phase: their size is compared."""
 
 
 @dataclass(frozen=True)
@@ -221,12 +223,16 @@ def _claims(answer: Answer) -> bool:
 def _main(effect: dict[str, Any]) -> tuple[str, float]:
     """Name and value of an effect's first parameter, its magnitude."""
     name, value = next(iter(effect["parameters"].items()))
-    return name, float(value)
+    return name, abs(float(value)) if name in SIGNLESS else float(value)
 
 
 def _interval(true: dict[str, Any], named: dict[str, Any]) -> tuple[float, float] | None:
-    parameter = named["parameters"].get(_main(true)[0])
-    return None if parameter is None or "interval95" not in parameter else tuple(parameter["interval95"])
+    name, _ = _main(true)
+    parameter = named["parameters"].get(name)
+    if parameter is None or "interval95" not in parameter:
+        return None
+    low, high = parameter["interval95"]
+    return (-high, -low) if name in SIGNLESS and parameter["value"] < 0 else (low, high)
 
 
 def magnitude_errors(answers: Iterable[Answer]) -> dict[bool, list[float]]:
@@ -237,7 +243,8 @@ def magnitude_errors(answers: Iterable[Answer]) -> dict[bool, list[float]]:
             name, value = _main(true)
             if name in named["parameters"]:
                 neutral = 1.0 if name in SCALES_FROM_ONE else 0.0
-                error = abs(named["parameters"][name]["value"] - value) / abs(value - neutral)
+                found = named["parameters"][name]["value"]
+                error = abs((abs(found) if name in SIGNLESS else found) - value) / abs(value - neutral)
                 errors[true["same_form"]].append(float(error))
     return errors
 

@@ -31,6 +31,7 @@ _STEPS = np.array([1.0, 0.3, 0.1, 0.03])  # shares of the screen's step that a f
 _WORTH_A_START = 0.2  # share of the best probe's gain at which a fit may start from another one
 _SIZES = np.array([-30.0, -10.0, -3.0, -1.0, 1.0, 3.0, 10.0, 30.0])  # probes, of an effect that is spoken for
 _FURTHEST = 20.0  # probes that the screen's step may be long
+_BETTER = 2.0  # nats by which a base must become better for its candidates to be fitted anew
 
 
 @dataclass(frozen=True)
@@ -99,19 +100,19 @@ class Search:
 
     def run(self) -> Explanation:
         """Add effects while they earn it, then take away those that the others have made needless."""
-        null = base = self.base()
-        stages = [self.stage(null)]
+        stages = [self.stage(self.base())]
         left = left_by(min((score.trial for score in stages[0].scores), key=lambda trial: trial.excess))
         if np.any(left > COARSE):  # only now it is known that nothing comes near the sensors' noise
             self._tolerance = left
-            null = base = self.base()
-            stages = [self.stage(null)]
+            stages = [self.stage(self.base())]
+        null = base = stages[0].base
         while (best := chosen(null, base, stages[-1].scores)) is not None:
             self._tolerance = left_by(best.trial)
             base = self.base([*base.hypothesis.candidates, best.candidate], best.trial.fit.u)
             if len(base.hypothesis.candidates) == MOST_EFFECTS:
                 break
             stages.append(self.stage(base))
+            base = stages[-1].base
         return Explanation(null, self._eliminated(base), tuple(stages))
 
     def base(self, effects: Sequence[Candidate] = (), start: Array | None = None) -> Base:
@@ -131,8 +132,8 @@ class Search:
         errors = self._tolerance * held_out.with_noise(held_out_noise).errors(found.u[None])[0]
         return Base(hypothesis, found, errors, noise, held_out_noise, self._tolerance)
 
-    def stage(self, base: Base) -> Stage:
-        """Screen all candidates, and fit the best."""
+    def stage(self, base: Base, polish: bool = True) -> Stage:
+        """Screen all candidates, and fit the best; from a better base, if these fits lead to one."""
         open_candidates = [c for c in self.candidates if c not in base.hypothesis.candidates]
         screened = []
         for done, candidate in enumerate(open_candidates):
@@ -142,10 +143,23 @@ class Search:
         spoken_for = self._spoken_for(base)
         promising = screened[:REFITTED] + [s for s in screened[REFITTED:] if s.candidate in spoken_for]
         trials = self.trials(base, [_Refit(one, one.candidate in spoken_for) for one in promising])
+        if polish and (better := self._polished(base, trials)) is not None:
+            return self.stage(better, polish=False)
         best = min(trials, key=lambda trial: trial.fit.loss + 0.5 * np.sum((trial.held_out / base.tolerance) ** 2))
         worth = worth_of(best)
         scores = [score_of(base, s, t, worth) for s, t in zip(promising, trials, strict=True)]
         return Stage(base, tuple(screened), tuple(sorted(scores, key=lambda score: -score.total)))
+
+    def _polished(self, base: Base, trials: Sequence[Trial]) -> Base | None:
+        """The base fitted from where candidates led its parameters; None where it comes out no better.
+
+        Or what a candidate's fit found, and the base's had missed, would count as the candidate's merit.
+        """
+        misfit = Misfit(base.hypothesis, self.data.fitted).with_noise(base.noise)
+        found = self._fit(misfit, misfit.best(np.array([trial.fit.u[: len(base.fit.u)] for trial in trials])))
+        if found.loss > base.fit.loss - _BETTER:
+            return None
+        return self.base(base.hypothesis.candidates, found.u)
 
     def screen(self, base: Base, candidate: Candidate) -> Screened:
         """What a candidate would gain if its best probe acted linearly."""
