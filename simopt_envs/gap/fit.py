@@ -18,8 +18,8 @@ from simopt_envs.measured.replay import start_sensitivity
 from simopt_envs.measured.windows import Windows
 from simopt_envs.physics.parameters import Array
 
-# Of a unit of u. Contacts and dry friction make predictions kink, so that derivatives over less tell of one kink and
-# lead a fit astray; over more, laws bend.
+# Of a unit of u, to both sides. Contacts and dry friction make predictions kink, so that derivatives over less tell of
+# one kink and lead a fit astray; over more, or to one side, laws bend.
 _DIFFERENCE = 0.1
 _KINK = 6.0  # medians: four standard deviations
 _DIVERGED = 30.0  # the error, in units of noise, of a sample that a simulation did not reach
@@ -115,13 +115,14 @@ class Misfit:
         losses += np.sum((starts / self.hypothesis.prior_std) ** 2, axis=1)
         return starts[np.argmin(losses)]
 
-    def jacobian(self, u: Array, errors: Array, columns: list[int]) -> Array:
-        """Derivative of the whitened errors by some of u (d,), (m, k); differences point into the bounds."""
-        steps = np.where(u[columns] + _DIFFERENCE <= self.hypothesis.high[columns], _DIFFERENCE, -_DIFFERENCE)
-        tried = np.tile(u, (len(columns), 1))
-        tried[np.arange(len(columns)), columns] += steps
-        moved = self.errors(tried).reshape(len(columns), -1)
-        return ((moved - errors.ravel()) / steps[:, None]).T
+    def jacobian(self, u: Array, columns: list[int]) -> Array:
+        """Derivative of the whitened errors by some of u (d,), (m, k), from both sides as far as bounds allow."""
+        ends = np.tile(u, (2, len(columns), 1))
+        both = np.array([[-_DIFFERENCE], [_DIFFERENCE]])
+        reached = np.clip(u[columns] + both, self.hypothesis.low[columns], self.hypothesis.high[columns])
+        ends[:, np.arange(len(columns)), columns] = reached
+        below, above = self.errors(ends.reshape(-1, len(u))).reshape(2, len(columns), -1)
+        return ((above - below) / np.diff(reached, axis=0).T).T
 
     def noise_at(self, u: Array, scale: Array) -> Noise:
         """The noise of sensors of a scale (c,) with what uncertain starts leave at u (d,)."""
@@ -169,9 +170,9 @@ def fit(misfit: Misfit, start: Array, iterations: int, known: Array | None = Non
         u = np.clip(columns.T, hypothesis.low, hypothesis.high)
         return np.hstack([misfit.errors(u).reshape(len(u), -1), u / hypothesis.prior_std]).T
 
-    def jacobian(u: Array, at: Array) -> Array:
+    def jacobian(u: Array, _: Array | None = None) -> Array:
         u = np.ravel(u)
-        differences = misfit.jacobian(u, np.ravel(at)[: -len(u)], fresh)
+        differences = misfit.jacobian(u, fresh)
         data = differences if known is None else np.hstack([known, differences])
         return np.vstack([data, np.diag(1 / hypothesis.prior_std)])
 
@@ -191,4 +192,4 @@ def fit(misfit: Misfit, start: Array, iterations: int, known: Array | None = Non
     )
     u = np.ravel(u)
     errors = misfit.errors(u[None])[0]
-    return Fit(u, errors.reshape(shape), jacobian(u, residual(u[:, None]))[: -len(u)], hypothesis.prior_std)
+    return Fit(u, errors.reshape(shape), jacobian(u)[: -len(u)], hypothesis.prior_std)

@@ -80,7 +80,8 @@ class Hypothesis:
         self._unit[: self.num_plain] = plain.prior.std
         for candidate, columns in self.columns.items():
             z = np.array([self.space.to_unconstrained(self._probe(candidate, p)) for p in self._probes(candidate)])
-            self._unit[columns] = np.abs(z - nominal).max(axis=0)[columns]
+            size = np.abs(z - nominal).max(axis=0)[columns]
+            self._unit[columns] = np.where(size > 0, size, 1.0)
         self.prior_std = np.full(len(nominal), _FREE)
         self.prior_std[: self.num_plain] = 1.0
         self.low, self.high = (self.coordinates(bound) for bound in (self.space.low, self.space.high))
@@ -136,7 +137,13 @@ class Hypothesis:
         return candidate.effect.probes(self.plain.model, candidate.place, self.motion)
 
     def _probe(self, candidate: Candidate, probe: dict[str, float]) -> Array:
-        return self.space.values({candidate.full_name(name): value for name, value in probe.items()})
+        """ξ (d,) of a probe. Of a joint that hardly moved a size may be out of bounds, or none: no try."""
+        values = {}
+        for name, value in probe.items():
+            parameter = self.space[candidate.full_name(name)]
+            size = np.clip(value, parameter.low, parameter.high)
+            values[parameter.name] = parameter.nominal if np.isnan(size) else float(size)
+        return self.space.values(values)
 
 
 class HypothesisSimulator:

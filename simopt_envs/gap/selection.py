@@ -77,11 +77,12 @@ def chosen(null: Base, base: Base, scores: Sequence[Score]) -> Score | None:
         return None
     best = earned[0]
     enough = base.excess - SIMPLER_SHARE * (base.excess - best.trial.excess)
+    clearly = max(SIMPLER, FURTHER * best.held_out)
     as_good = [
         s
         for s in earned
-        if best.held_out - s.held_out < SIMPLER
-        or best.total - s.total < SIMPLER
+        if best.held_out - s.held_out < clearly
+        or best.total - s.total < clearly
         or enough > s.trial.excess > best.trial.excess > EXPLAINED - 1
     ]
     return min(as_good, key=lambda score: (len(score.trial.fit.u), -score.total))

@@ -147,7 +147,7 @@ class _Experiment:
         u, misfit = final.fit.u, Misfit(final.hypothesis, windows)
         misfit = misfit.with_noise(misfit.noise_at(u, final.sensor_noise * final.tolerance))
         errors = misfit.errors(u[None])[0]
-        fit = Fit(u, errors, misfit.jacobian(u, errors, list(range(len(u)))), final.fit.prior_std)
+        fit = Fit(u, errors, misfit.jacobian(u, list(range(len(u)))), final.fit.prior_std)
         return cls(windows, misfit.noise, final.hypothesis, fit)
 
     def windows_of(self, recording: Recording) -> NDArray[np.intp]:
@@ -168,7 +168,7 @@ class _Experiment:
         at = np.append(self.fit.u[others], size)
         misfit = Misfit(rival, self.windows).with_noise(self.noise)
         with_partner = misfit.errors(at[None])[0]
-        jacobian = misfit.jacobian(at, with_partner, rival.columns[partner])
+        jacobian = misfit.jacobian(at, rival.columns[partner])
         changes = [(errors - without).reshape(-1, 1) for errors in (with_effect, with_partner)]
         columns = np.hstack([self.fit.jacobian[:, others], jacobian, *changes])
         columns = columns.reshape(len(self.windows), -1, columns.shape[1])

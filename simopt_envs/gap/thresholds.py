@@ -16,7 +16,8 @@ EXPLAINED = 1.25
 """Mean square of the whitened errors up to which a model counts as right; noise alone leaves 1."""
 
 SIMPLER = 5.0
-"""Nats by which a candidate with more parameters must win, held out and in all, over one with fewer."""
+"""Nats by which a candidate with more parameters must win, held out and in all, over one with fewer; or, where that is
+more, the share ``FURTHER`` of what it gains on held-out data."""
 
 SIMPLER_SHARE = 0.8
 """Share of what the best takes from the held-out excess at which a candidate with fewer parameters is as good, where
