@@ -43,8 +43,7 @@ def write_log(path, seed):
 @pytest.fixture(autouse=True)
 def workplace(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    for module in ("runs", "adapt"):
-        monkeypatch.setattr(f"baselines.commands.{module}.write_report", lambda directory: directory / "report.html")
+    monkeypatch.setattr("baselines.commands.runs.write_report", lambda directory: directory / "report.html")
     (tmp_path / "arm.xml").write_text(PENDULUM.format(friction=0.001))
     (tmp_path / "xi.yaml").write_text(XI)
     write_log(tmp_path / "run_1.csv", 0)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import toy_reach  # noqa: F401 - registers an environment that is none of this package
 from conftest import needs_batch
 
 from baselines.commands.gap import environment
@@ -11,33 +12,55 @@ from simopt_envs.measured import load_recording
 from simopt_envs.tasks.effects import with_effects
 
 DRAWER = "SimOpt/Drawer-v0"
-COLUMNS = ("qpos/joint*", "qpos/finger_*", "site/handle/*")
 LOAD = {"effect": "payload", "where": "body:link7", "parameters": {"mass": 2.5}}
 
 
 class Reach:
     """Moves as fast as what it sees of the second joint tells."""
 
+    def __init__(self, actions=8):
+        self.actions = actions
+
     def act(self, observations):
-        return np.tile(0.5 + observations[:, 1:2], (1, 8)).clip(-1, 1)
+        return np.tile(0.5 + observations[:, 1:2], (1, self.actions)).clip(-1, 1)
 
 
 @needs_batch
 def test_rollouts_are_those_of_the_hidden_system_and_their_logs_show_them(tmp_path):
-    robot = LoggedSystem(with_effects(DRAWER, [LOAD]), tmp_path, COLUMNS, {}, per_step=5)
-    rolled = robot.rollout(Reach(), 2, np.random.default_rng(1))
-    hidden = HiddenSystem(with_effects(DRAWER, [LOAD]), {}).rollout(Reach(), 2, np.random.default_rng(1))
-    without = HiddenSystem(DRAWER, {}).rollout(Reach(), 2, np.random.default_rng(1))
+    noise = {"joint*": 0.01, "handle_*": 0.004}
+    robot = LoggedSystem(with_effects(DRAWER, [LOAD]), tmp_path, noise=noise)
+    hidden, without = HiddenSystem(with_effects(DRAWER, [LOAD]), {}, noise), HiddenSystem(DRAWER, {}, noise)
+    rolled, same, other = (system.rollout(Reach(), 2, np.random.default_rng(1)) for system in (robot, hidden, without))
+    assert robot.identity() == hidden.identity()
     assert robot.evaluate(Reach(), 3, np.random.default_rng(1)) == 0.0
-    logs = [load_recording(path) for path in robot.logs()]
-    assert len(logs) == 2
-    for real, same, other, log in zip(rolled, hidden, without, logs, strict=True):
-        np.testing.assert_allclose(real.observations, same.observations, atol=1e-9)
-        assert np.abs(real.observations - other.observations).max() > 0.01
-        for channel, column in ((1, "qpos/joint2"), (8, "site/handle/y")):
-            np.testing.assert_allclose(log[column][::5], real.observations[:, channel], atol=1e-9)
-        assert "qpos/drawer" not in log.columns
+    assert sorted(tmp_path.iterdir()) == sorted(map(robot.log, rolled))
+    for real, as_hidden, as_other in zip(rolled, same, other, strict=True):
+        np.testing.assert_array_equal(real.observations, as_hidden.observations)
+        assert np.abs(real.observations - as_other.observations).max() > 0.01
+        log = load_recording(robot.log(real))
         assert log.period == pytest.approx(0.012)
+        for channel, column, std in ((1, "qpos/joint2", 0.01), (8, "site/handle/y", 0.004)):
+            apart = log[column][::5] - real.observations[:, channel]  # two sensors' noise
+            assert 0.6 * std < apart.std() / np.sqrt(2) < 1.4 * std
+
+
+def test_a_log_holds_what_a_robot_knows_of_itself_and_what_its_policy_sees(tmp_path):
+    for env_id, actions, (*fingers, site) in (
+        (DRAWER, 8, ("finger_left", "finger_right", "handle")),
+        ("SimOpt/SwingPeg-v0", 7, ("peg",)),
+    ):
+        robot = LoggedSystem(env_id, tmp_path)
+        (rolled,) = robot.rollout(Reach(actions), 1, np.random.default_rng(2))
+        log = load_recording(robot.log(rolled))
+        joints = [*(f"joint{i}" for i in range(1, 8)), *fingers]
+        assert set(log.signals) == {*(f"qpos/{name}" for name in joints), *(f"site/{site}/{axis}" for axis in "xyz")}
+        apart = log["qpos/joint3"][::5] - rolled.observations[:, 2]  # of a target without noise
+        assert 0.6e-3 < apart.std() < 1.4e-3
+
+
+def test_an_environment_of_others_has_no_log(tmp_path):
+    with pytest.raises(ValueError, match="Toy/Reach-v0 is no environment of this package"):
+        LoggedSystem("Toy/Reach-v0", tmp_path)
 
 
 @pytest.mark.parametrize(("env_id", "kept"), [(DRAWER, "cabinet_x"), ("SimOpt/SwingPeg-v0", "joint_gain_1")])

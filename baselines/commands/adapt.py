@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field, replace
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -11,20 +13,27 @@ import tyro
 
 from baselines.commands import inputs
 from baselines.commands.engines import EngineOptions
+from baselines.commands.gap import environment, explain, told, ways_on
 from baselines.commands.parameter_file import read_parameters
 from baselines.commands.progress import Display
 from baselines.commands.recordings import HeldOut, read_split
-from baselines.commands.runs import control_period, run_loop
-from simopt_envs.adaptation import CEM, REPS, EnvSimulator, HiddenSystem, RecordedSystem, ReplaySimulator, SimOpt
+from baselines.commands.runs import conclude, control_period, interruptible, run_loop
+from baselines.logged_system import LoggedSystem
+from simopt_envs.adaptation import CEM, REPS, EnvSimulator, Event, HiddenSystem, RecordedSystem, ReplaySimulator, SimOpt
 from simopt_envs.adaptation.checkpoint import write_json
 from simopt_envs.adaptation.fitting import CMAES, LeastSquares, WindowMisfit, untold_combinations
 from simopt_envs.adaptation.updates import Update
+from simopt_envs.distributions import Gaussian
 from simopt_envs.physics import ModelWriter
-from simopt_envs.report import Details, write_report
+from simopt_envs.physics.effects import require_mujoco
+from simopt_envs.report import Details, Run
 
 MODEL_SUFFIXES = (".xml", ".mjcf", ".urdf")
 _XI_PER_UPDATE = 200
 _FITS = ("cmaes", "least-squares")
+_GAP = "gap"
+_MOST_LOGS = 12  # the latest, that are looked at: the search takes its time
+_EXPLAINED = "Parameters within p(ξ) explain the measured rollouts: what is left is noise."
 
 
 @dataclass(frozen=True)
@@ -49,6 +58,9 @@ class Adapt:
     parameter's unit. NAME may be a pattern (joint_gain_*). The drawer has defaults."""
     evaluation_episodes: int = 100
     """Environment: episodes that count successes on the target; they are never used to adapt."""
+    explain: bool = True
+    """Environment of this package: log the rollouts measured on the target (OUT/recordings) and, where the adapted p(ξ)
+    leaves more of them than noise, look for the missing effect: gap.json, report.html and repaired model in OUT/gap."""
     data: tuple[Path, ...] = ()
     """Model: recordings of the real system (CSV, Parquet, NPZ, MAT, or minari:ID)."""
     parameters: Path | None = None
@@ -99,11 +111,19 @@ class Adapt:
         display = Display()
         simulator = EnvSimulator(self.system, engine=self.where.make(display.tasks))
         real_rollouts = 3 if self.real_rollouts is None else self.real_rollouts
+        prior = inputs.distribution(self.system, simulator.parameters, self.vary)
+        robot = self._robot(target, prior, display)
+
+        def note(event: Event) -> None:
+            if event.status == "started":  # so that a gap found in fewer iterations is none of this run's
+                shutil.rmtree(self.out / _GAP, ignore_errors=True)
+            display.event(event)
+
         loop = SimOpt(
             simulator,
-            inputs.distribution(self.system, simulator.parameters, self.vary),
+            prior,
             inputs.make_trainer(self.trainer, display.training),
-            HiddenSystem(self.system, target.parameters, target.noise, target.dropout),
+            robot,
             update=self._update(),
             simulated_rollouts=_XI_PER_UPDATE * real_rollouts if self.rollouts is None else self.rollouts,
             real_rollouts=real_rollouts,
@@ -111,9 +131,9 @@ class Adapt:
             evaluation_episodes=self.evaluation_episodes,
             seed=self.seed,
             directory=self.out,
-            on_event=display.event,
+            on_event=note,
         )
-        run_loop(
+        last = run_loop(
             loop,
             self.iterations,
             display,
@@ -122,6 +142,45 @@ class Adapt:
             resume=self.resume,
             film=self.system,
         )
+        if isinstance(robot, LoggedSystem):
+            with interruptible(resume_with(typed)):
+                self._explain(robot, [last.distribution, prior], display)
+
+    def _robot(self, target: inputs.Target, prior: Gaussian, display: Display) -> HiddenSystem | LoggedSystem:
+        """The hidden system, with logs of its rollouts where the gap workflow can take them."""
+        hidden = target.parameters, target.noise, target.dropout
+        system = HiddenSystem(self.system, *hidden)
+        if self.explain:
+            try:
+                require_mujoco()
+                environment(self.system, prior)
+            except (ImportError, ValueError) as reason:
+                display.say(f"Nothing will look for what p(ξ) cannot explain: {reason}")
+            else:
+                return LoggedSystem(self.system, self.out / "recordings", *hidden)
+        return system
+
+    def _explain(self, robot: LoggedSystem, distributions: Sequence[Gaussian], display: Display) -> None:
+        """Say whether a p(ξ) explains the rollouts of a finished run, and what is missing where none does."""
+        run, folder = Run.load(self.out), self.out / _GAP
+        measured = [trajectory for k in range(len(run.iterations)) for trajectory in run.real(k)]
+        logs = [log for log in map(robot.log, measured) if log.exists()][-_MOST_LOGS:]
+        finding, ways = _EXPLAINED, []
+        if len(logs) < 2:
+            finding = f"To see what p(ξ) cannot explain takes two logged rollouts at least, here {len(logs)}."
+        else:
+            display.say("looking for what p(ξ) cannot explain")
+            try:
+                explained = explain(self.system, distributions, logs, folder, display.console)
+            except ValueError as error:
+                finding = f"What p(ξ) cannot explain could not be looked for: {error}"
+            else:
+                if not explained:
+                    finding = f"p(ξ) leaves more of the measured rollouts than noise; the gap workflow: {told(folder)}"
+                    ways = ways_on(self.system, folder)
+        conclude(self.out, [finding], display)
+        for line in ways:
+            display.say(line)
 
     def _adapt_model(self, typed: str) -> None:
         from simopt_envs.adaptation import window_trajectories
@@ -171,10 +230,7 @@ class Adapt:
         else:
             findings = ["Nothing was held out, so nothing here shows what the model is worth on new data.", *findings]
         write_json(self.out / "result.json", result)
-        replace(details, notes=(*warnings, *findings)).save(self.out)
-        write_report(self.out)
-        for finding in findings:
-            display.say(finding)
+        conclude(self.out, findings, display)
 
     def _update(self) -> Update:
         return REPS(epsilon=self.epsilon) if self.update == "reps" else CEM(epsilon=self.epsilon)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,14 +11,13 @@ from typing import Any
 import numpy as np
 
 from baselines.commands import inputs
-from baselines.commands.gap import HOME, environment
+from baselines.commands.gap import explain, told, told_effect
 from baselines.commands.progress import Display
 from baselines.commands.runs import control_period, run_loop
 from baselines.logged_system import LoggedSystem
 from simopt_envs.adaptation import EnvSimulator, SimOpt
 from simopt_envs.adaptation.records import Iteration
 from simopt_envs.distributions import Gaussian
-from simopt_envs.measured import load_recording
 from simopt_envs.physics import ParameterSpace
 from simopt_envs.physics.effects import object_name
 from simopt_envs.report import Details
@@ -33,10 +32,6 @@ HIDDEN: tuple[Mapping[str, Any], ...] = (
 """What the hidden arm may have: a load at the hand, a cable that pulls the shoulder, a shoulder that runs in oil."""
 
 _NOISE = 0.002  # rad, m
-_LOGGED = ("qpos/joint*", "qpos/finger_*", "site/handle/*")
-_LOG_NOISE = {"qpos/joint*": _NOISE, "site/handle/*": _NOISE, "qpos/finger_*": 1e-4}
-_PER_STEP = 5  # measurements of the log in a step of the policy: every 12 ms
-_JERK = 0.1  # s at the start of an episode in which the arm jerks off from rest, which no smoothed position shows
 _ROLLOUTS = 6  # measured per iteration
 _ENOUGH = 0.9
 _NORMAL_95 = 1.96
@@ -62,15 +57,14 @@ class GapDemo:
         """Adapt, name what is missing, repair, adapt again; whatever is there already is kept."""
         inputs.require_free(self.out, resume=True)
         hidden, display = HIDDEN[self.seed % len(HIDDEN)], Display()
-        robot = LoggedSystem(
-            with_effects(ENV_ID, [hidden]), self.out / "recordings", _LOGGED, _LOG_NOISE, _PER_STEP, noise=_NOISE
-        )
-        display.say(f"{ENV_ID}: the target has what no parameter of the simulation stands for: {_told(hidden)}")
+        robot = LoggedSystem(with_effects(ENV_ID, [hidden]), self.out / "recordings", noise=_NOISE)
+        display.say(f"{ENV_ID}: the target has what no parameter of the simulation stands for: {told_effect(hidden)}")
         simulator = EnvSimulator(ENV_ID)
         prior = inputs.distribution(ENV_ID, simulator.parameters, ())
         first, alone = self._adapt(simulator, prior, robot, self.out)
 
-        effects = self._missing(robot, display)
+        # The rollouts that SimOpt adapted to, in vain.
+        effects = self._missing(prior, [robot.log(trajectory) for trajectory in first.real], display)
         if not effects:
             display.say("The gap workflow names nothing; the simulation cannot be repaired.")
             return
@@ -83,7 +77,7 @@ class GapDemo:
             ("adapted with the missing effect", after),
         ):
             display.say(f"{label:34} {step.target_success or 0.0:6.0%} success on the target")
-        display.say(f"hidden: {_told(hidden)}; named: {'; '.join(map(_told, effects))}")
+        display.say(f"hidden: {told_effect(hidden)}; named: {'; '.join(map(told_effect, effects))}")
 
     def _adapt(
         self,
@@ -117,18 +111,13 @@ class GapDemo:
         run_loop(loop, 1, display, details, self.typed, resume=True, enough=enough)
         return steps[0], steps[-1]
 
-    def _missing(self, robot: LoggedSystem, display: Display) -> list[dict[str, Any]]:
-        """What the gap workflow names in the logs of the rollouts that SimOpt adapted to; entries of ``gap.json``."""
+    def _missing(self, prior: Gaussian, logs: Sequence[Path], display: Display) -> list[dict[str, Any]]:
+        """What the gap workflow names in logs; entries of ``gap.json``."""
         folder = self.out / "gap"
-        if not (folder / "gap.json").exists():
-            from simopt_envs.gap import find_gap
-
-            spec, plain = environment(ENV_ID)
-            fitted = robot.logs()[:_ROLLOUTS]  # those that SimOpt adapted to, in vain
-            logs = [load_recording(path).select(start=_JERK) for path in fitted]
-            gap = find_gap(spec, logs, plain=plain, keyframe=HOME)
-            display.say(str(gap))
-            display.say(f"report: {gap.save(folder) / 'report.html'}")
+        if explain(ENV_ID, [prior], logs, folder, display.console):
+            return []
+        display.say(told(folder))
+        display.say(f"report: {folder / 'report.html'}")
         effects: list[dict[str, Any]] = json.loads((folder / "gap.json").read_text())["effects"]
         return effects
 
@@ -146,10 +135,3 @@ def _joined(prior: Gaussian, space: ParameterSpace, effects: list[dict[str, Any]
     std = np.maximum((high - low) / (2 * _NORMAL_95), _LEAST_STD * np.where(added.is_log, 1.0, np.abs(mean)))
     covariance = np.diag(np.append(prior.std, std) ** 2)
     return Gaussian(space.subset([*prior.space.names, *added.names]), np.append(prior.mean, mean), covariance)
-
-
-def _told(entry: Mapping[str, Any]) -> str:
-    """``coulomb_friction at joint:joint4 (frictionloss 13)``."""
-    values = {k: v["value"] if isinstance(v, Mapping) else v for k, v in entry["parameters"].items()}
-    numbers = ", ".join(f"{name} {value:.3g}" for name, value in values.items())
-    return f"{entry['effect']} at {entry['where']} ({numbers})"

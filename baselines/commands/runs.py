@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 
 import gymnasium as gym
 
 from baselines.commands.progress import Display
 from simopt_envs.adaptation import Iteration, SimOpt
-from simopt_envs.report import Details, write_report
+from simopt_envs.report import Details, Run, write_report
 from simopt_envs.report.film import STRIP, film_policies
 
 
@@ -42,7 +44,7 @@ def run_loop(
     steps = loop.run(iterations, resume=resume)  # raises before anything is written
     assert loop.directory is not None
     details.save(loop.directory)
-    try:
+    with interruptible(resume_with):
         with display:
             for step in steps:
                 if step.index == 0:
@@ -53,13 +55,29 @@ def run_loop(
         if film is not None and (display.computed or not (loop.directory / STRIP).exists()):
             display.say("filming the policy on the target")
             details = _film(film, {"before adaptation": first, f"after iteration {step.index}": step}, loop, details)
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt(f"interrupted; go on with: {resume_with}") from None
     details.save(loop.directory)
     for line in (str(step.verdict), *details.notes):
         display.say(line)
     display.say(f"report: {write_report(loop.directory)}")
     return step
+
+
+@contextmanager
+def interruptible(resume_with: str) -> Iterator[None]:
+    """Ctrl-C says what to type to go on."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"interrupted; go on with: {resume_with}") from None
+
+
+def conclude(directory: Path, findings: Sequence[str], display: Display) -> None:
+    """Add sentences to the report of a finished run, and print them."""
+    details = Run.load(directory).details
+    replace(details, notes=(*details.notes, *findings)).save(directory)
+    write_report(directory)
+    for finding in findings:
+        display.say(finding)
 
 
 def control_period(env_id: str) -> float | None:
