@@ -144,6 +144,9 @@ def _figure(results: Results) -> Figure:
 
 
 def _draw_instances(axes: Axes, task: str, instances: list[Result]) -> None:
+    if not instances:
+        axes.set_axis_off()
+        return
     x, y = _SHOWN[task]
     for index, (label, solved) in enumerate((("solved", True), ("not solved", False))):
         chosen = [i["xi"] for i in instances if (i["success"] >= _SOLVED) is solved]
