@@ -29,7 +29,7 @@ Progress = Callable[[str, int, int], None]
 _ITERATIONS = 10
 _STEPS = np.array([1.0, 0.3, 0.1, 0.03])  # shares of the screen's step that a fit may start from
 _WORTH_A_START = 0.2  # share of the best probe's gain at which a fit may start from another one
-_SIZES = np.array([-30.0, -10.0, -3.0, -1.0, 1.0, 3.0, 10.0, 30.0])  # probes, of an effect that is spoken for
+_SIZES = np.array([-30.0, -10.0, -3.0, -1.0, 1.0, 3.0, 10.0, 30.0])  # probes, of effects that may be large
 _FURTHEST = 20.0  # probes that the screen's step may be long
 _BETTER = 2.0  # nats by which a base must become better for its candidates to be fitted anew
 
@@ -250,28 +250,39 @@ class _Refit:
 
 
 def _fitted(refit: _Refit, base: Base, fitted: Windows, held_out: Windows, num_threads: int) -> Result:
-    """The fit of a candidate, and its errors on what was held out; the base's derivatives are taken as known.
+    """The fit of a candidate, and its errors on what was held out; near the base, its derivatives are taken as known.
 
     Where plain parameters far from their priors speak for the candidate, it is fitted from the priors' means too: a
     base that they have bent is the end of a valley that leads away from the right one.
     """
     screened, hypothesis = refit.screened, refit.screened.hypothesis
     misfit = Misfit(hypothesis, fitted, num_threads).with_noise(base.noise)
-    found = fit(misfit, misfit.best(screened.starts), _ITERATIONS, known=base.fit.jacobian)
+    start, of_base = hypothesis.neutral(), len(base.fit.u)
+    start[base.hypothesis.num_plain : of_base] = base.fit.u[base.hypothesis.num_plain :]
+    fresh = _sized(screened, start, of_base)
+    start[:of_base] = base.fit.u
+    nearby = misfit.best(screened.starts)
+    best = misfit.best(np.concatenate([nearby[None], _sized(screened, start, of_base), fresh]))
+    known = base.fit.jacobian if np.array_equal(best, nearby) else None  # far from the base it is another
+    found = fit(misfit, best, _ITERATIONS, known=known)
     if refit.spoken_for:
-        start = hypothesis.neutral()
-        effects = slice(base.hypothesis.num_plain, len(base.fit.u))
-        start[effects] = base.fit.u[effects]
-        probes = hypothesis.probes(screened.candidate)
-        probes[:, : len(base.fit.u)] = start[: len(base.fit.u)]
-        amounts = hypothesis.amounts(screened.candidate)
-        tried = np.tile(probes, (len(_SIZES), 1, 1))
-        tried[..., amounts] = start[amounts] + _SIZES[:, None, None] * (probes[:, amounts] - start[amounts])
-        tried = np.clip(tried.reshape(-1, len(start)), hypothesis.low, hypothesis.high)
-        other = fit(misfit, misfit.best(tried), _ITERATIONS)
+        other = fit(misfit, misfit.best(fresh), _ITERATIONS)
         found = min(found, other, key=lambda f: f.loss)
     test = Misfit(hypothesis, held_out, num_threads).with_noise(base.held_out_noise)
     return {**vars(found), "held_out": base.tolerance * test.errors(found.u[None])[0]}
+
+
+def _sized(screened: Screened, start: Array, of_base: int) -> Array:
+    """Starts with a candidate of several sizes, the first so many coordinates as in a start (d,): (k, d).
+
+    A large effect is far beyond what a linear screen can tell of its size.
+    """
+    hypothesis, amounts = screened.hypothesis, screened.hypothesis.amounts(screened.candidate)
+    probes = hypothesis.probes(screened.candidate)
+    probes[:, :of_base] = start[:of_base]
+    sized = np.tile(probes, (len(_SIZES), 1, 1))
+    sized[..., amounts] = start[amounts] + _SIZES[:, None, None] * (probes[:, amounts] - start[amounts])
+    return np.clip(sized.reshape(-1, len(start)), hypothesis.low, hypothesis.high)
 
 
 def _clipped(step: float, shift: Array, neutral: Array, hypothesis: Hypothesis, columns: list[int]) -> float:
