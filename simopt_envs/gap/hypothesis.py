@@ -10,8 +10,9 @@ import mujoco
 import numpy as np
 
 from simopt_envs.gap.plain import INTEGRATION_LEAD, Plain
-from simopt_envs.measured.channels import Channel
-from simopt_envs.measured.states import States, reference_qpos
+from simopt_envs.gap.starts import loads, starts_of
+from simopt_envs.measured.channels import Channel, model_channels
+from simopt_envs.measured.states import States
 from simopt_envs.measured.windows import Windows, WindowSimulator
 from simopt_envs.physics.columns import ColumnModel, CommandModel, acts_on_columns
 from simopt_envs.physics.effects import Effect, Motion, object_name
@@ -20,7 +21,6 @@ from simopt_envs.physics.effects.joints import scalar_joints
 from simopt_envs.physics.parameters import Array, Parameter, ParameterSpace
 
 _FREE = 100.0  # an effect's parameter has a prior this many probes wide: none to speak of
-_NEW_JOINT_ERROR = 1e-3  # rad or m, rad/s or m/s: a joint that an effect adds starts near its reference, at rest
 
 
 @dataclass(frozen=True)
@@ -112,9 +112,13 @@ class Hypothesis:
 
     def is_itself(self, candidate: Candidate, u: Array) -> bool:
         """Whether a candidate's parameters at u (d,) are what its name means."""
-        xi, prefix = self.xi(u[None])[0], candidate.full_name("")
-        values = {self.space.names[i].removeprefix(prefix): float(xi[i]) for i in self.columns[candidate]}
+        values = self.values(candidate, self.xi(u[None])[0])
         return candidate.effect.is_itself(self.plain.model, candidate.place, self.motion, values)
+
+    def values(self, candidate: Candidate, xi: Array) -> dict[str, float]:
+        """A candidate's parameters in ξ (d,), by the names that its effect gives them."""
+        prefix = candidate.full_name("")
+        return {self.space.names[i].removeprefix(prefix): float(xi[i]) for i in self.columns[candidate]}
 
     def amounts(self, candidate: Candidate) -> list[int]:
         """The columns of a candidate that say how much of the effect there is, not what shape it has."""
@@ -151,17 +155,21 @@ class HypothesisSimulator:
 
     def __init__(self, hypothesis: Hypothesis, windows: Windows, num_threads: int = 0):
         self._given, self._sources = windows, command_sources(hypothesis.model)
+        channels = model_channels(hypothesis.model)  # a joint that an effect adds shifts those after it
         self.windows = replace(
             windows,
+            channels=tuple(channels[name] for name in windows.names),
             commands=windows.commands[..., self._sources],
             past_commands=windows.past_commands[..., self._sources],
-            starts=_starts_of(hypothesis.model, windows.starts, hypothesis.plain.model),
+            starts=starts_of(hypothesis.model, windows.starts, hypothesis.plain.model),
         )
-        self._nominal = hypothesis.space.nominal[None]
+        self._hypothesis, self._nominal = hypothesis, hypothesis.space.nominal[None]
+        given = hypothesis.plain.model
+        self._loads = loads(given, windows) if given.nq < hypothesis.model.nq else {}
         self._model, self._period = hypothesis.model, float(windows.offsets[1])
         self._scalar = scalar_joints(hypothesis.model)
         self._lead = [i for i, p in enumerate(hypothesis.space) if p.name == INTEGRATION_LEAD]
-        self._ahead = [c for c, channel in enumerate(windows.channels) if _is_position(hypothesis.model, channel)]
+        self._ahead = [c for c, channel in enumerate(self.windows.channels) if _is_position(hypothesis.model, channel)]
         self._columns = ColumnModel(hypothesis.space, windows.names)
         drives = [object_name(place) for place in actuators(hypothesis.plain.model)]
         self._commands = CommandModel(hypothesis.space, drives)
@@ -199,10 +207,21 @@ class HypothesisSimulator:
                 values = getattr(starts, channel.kind)[:, channel.index]
                 rate = starts.qvel[:, self._dof(channel)] if channel.kind == "qpos" else np.zeros(len(starts))
                 getattr(repeated, channel.kind)[:, channel.index] = self._columns.meant(values, rate, c, xi).ravel()
+        if self._loads:
+            self._deflect(repeated.qpos, xi)
         leads = np.repeat(np.sum(xi[:, self._lead], axis=1), len(starts))
         for qpos, qvel, lead in zip(repeated.qpos, repeated.qvel, leads, strict=True):
             mujoco.mj_integratePos(self._model, qpos, qvel, float(lead))
         return repeated
+
+    def _deflect(self, qpos: Array, xi: Array) -> None:
+        """Move the joints that effects add to where they rest under their loads, in place."""
+        per_xi = qpos.reshape(len(xi), len(self._given), -1)
+        for candidate in self._hypothesis.candidates:
+            for at_xi, row in zip(per_xi, xi, strict=True):
+                values = self._hypothesis.values(candidate, row)
+                for name, position in candidate.effect.rest(candidate.place, values, self._loads).items():
+                    at_xi[:, int(self._model.joint(name).qposadr[0])] += position
 
 
 def _is_position(model: mujoco.MjModel, channel: Channel) -> bool:
@@ -210,23 +229,3 @@ def _is_position(model: mujoco.MjModel, channel: Channel) -> bool:
     if channel.kind == "sensordata":
         return int(model.sensor_needstage[channel.object]) == int(mujoco.mjtStage.mjSTAGE_POS)
     return channel.kind in ("qpos", "site_xpos")
-
-
-def _starts_of(model: mujoco.MjModel, starts: States, given: mujoco.MjModel) -> States:
-    """The starts of the model as given in a model with more joints, those at their reference."""
-    if given.nq == model.nq:
-        return starts
-    w = len(starts)
-    qpos, qvel = np.tile(reference_qpos(model), (w, 1)), np.zeros((w, model.nv))
-    errors = [np.full((w, model.nv), _NEW_JOINT_ERROR) for _ in range(2)]
-    for j in range(given.njnt):
-        new = model.joint(given.joint(j).name)
-        old = given.joint(j)
-        qpos[:, new.qposadr[0] : new.qposadr[0] + len(old.qpos0)] = starts.qpos[
-            :, old.qposadr[0] : old.qposadr[0] + len(old.qpos0)
-        ]
-        of_new = slice(new.dofadr[0], new.dofadr[0] + len(old.damping))
-        of_old = slice(old.dofadr[0], old.dofadr[0] + len(old.damping))
-        for target, source in zip((qvel, *errors), (starts.qvel, starts.qpos_error, starts.qvel_error), strict=True):
-            target[:, of_new] = source[:, of_old]
-    return States(qpos, qvel, *errors)

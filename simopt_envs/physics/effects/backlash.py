@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import mujoco
 import numpy as np
 
-from simopt_envs.physics.effects.effect import Effect, Motion, object_name
+from simopt_envs.physics.effects.effect import Effect, Motion, Values, object_name
 from simopt_envs.physics.effects.joints import add_link_joint, dof, outermost_joints, position_unit
-from simopt_envs.physics.parameters import Parameter, Write
+from simopt_envs.physics.parameters import Array, Parameter, Write
 
 _REACH = 1e-5  # rad or m: how far before the end of its range a stop acts
 
@@ -49,3 +51,8 @@ class Backlash(Effect):
         i = dof(model, object_name(place))
         travel = float(motion.high[i] - motion.low[i])
         return tuple({"play": part * travel} for part in (0.005, 0.02))
+
+    def rest(self, place: str, values: Values, loads: Mapping[str, Array]) -> dict[str, Array]:
+        """See :meth:`Effect.rest`."""
+        joint = object_name(place)
+        return {f"{joint}.play": 0.5 * values["play"] * np.sign(loads[joint])}

@@ -80,6 +80,10 @@ class Effect(ABC):
         a detent) needs a probe of its own. Every parameter differs from its nominal in at least one probe.
         """
 
+    def rest(self, place: str, values: Values, loads: Mapping[str, Array]) -> dict[str, Array]:
+        """Where the joints that it adds rest, by name, under the loads (w,) [N m, N] that joints carry."""
+        return {}
+
     def is_itself(self, model: mujoco.MjModel, place: str, motion: Motion, values: Values) -> bool:
         """Whether fitted values are what the effect's name means, where other effects can look the same."""
         return True

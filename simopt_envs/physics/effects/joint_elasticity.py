@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import mujoco
 
-from simopt_envs.physics.effects.effect import Effect, Motion, object_name
+from simopt_envs.physics.effects.effect import Effect, Motion, Values, object_name
 from simopt_envs.physics.effects.joints import (
     add_link_joint,
     dof,
@@ -13,7 +15,7 @@ from simopt_envs.physics.effects.joints import (
     probe_force,
     stiffness_unit,
 )
-from simopt_envs.physics.parameters import Parameter, Write
+from simopt_envs.physics.parameters import Array, Parameter, Write
 
 _RIGID = 1e3  # stiffness that counts as infinite, in units of inertia / timestep^2
 
@@ -55,3 +57,8 @@ class JointElasticity(Effect):
         i = dof(model, joint)
         travel = float(motion.high[i] - motion.low[i])
         return tuple({"stiffness": probe_force(model, joint, motion) / (part * travel)} for part in (2e-4, 1e-3))
+
+    def rest(self, place: str, values: Values, loads: Mapping[str, Array]) -> dict[str, Array]:
+        """See :meth:`Effect.rest`."""
+        joint = object_name(place)
+        return {f"{joint}.link": loads[joint] / values["stiffness"]}
