@@ -20,7 +20,7 @@ from typing import Any
 import mujoco
 import numpy as np
 from mujoco import minimize
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import qr, solve_triangular
 
 from simopt_envs.adaptation.updates import UpdateResult
@@ -57,6 +57,10 @@ class Noise:
         columns = np.moveaxis((starts / scale).reshape(*starts.shape[:2], -1), 0, -1)
         basis, size, _ = np.linalg.svd(columns, full_matrices=False)
         return cls(scale, basis, 1 - 1 / np.sqrt(1 + size**2))
+
+    def select(self, rows: NDArray[np.intp]) -> Noise:
+        """That of some windows, in the order given."""
+        return Noise(self.scale, self.basis[rows], self.shrink[rows])
 
     def whiten(self, errors: Array) -> Array:
         """Errors (n, w, S, c) -> independent ones of variance 1, (n, w, S, c)."""

@@ -18,9 +18,9 @@ from simopt_envs.measured.replay import start_sensitivity
 from simopt_envs.measured.windows import Windows
 from simopt_envs.physics.parameters import Array
 
-# Of a unit of u, to both sides. Contacts and dry friction make predictions kink, so that derivatives over less tell of
-# one kink and lead a fit astray; over more, or to one side, laws bend.
-_DIFFERENCE = 0.1
+# Of a unit of u, to both sides, one after another. Contacts and dry friction make predictions kink: derivatives over
+# less tell of one kink and lead a fit astray, those over much lead it across them and past where laws bend.
+_DIFFERENCES = (1.0, 0.3, 0.1)
 _KINK = 6.0  # medians: four standard deviations
 _DIVERGED = 30.0  # the error, in units of noise, of a sample that a simulation did not reach
 
@@ -111,14 +111,17 @@ class Misfit:
 
     def best(self, starts: Array) -> Array:
         """The start (d,), of several (k, d), from which a fit has the least left to do."""
-        losses = np.sum(self.errors(starts) ** 2, axis=(1, 2, 3))
-        losses += np.sum((starts / self.hypothesis.prior_std) ** 2, axis=1)
-        return starts[np.argmin(losses)]
+        return starts[np.argmin(self.losses(starts))]
 
-    def jacobian(self, u: Array, columns: list[int]) -> Array:
+    def losses(self, u: Array) -> Array:
+        """-log p(u | data) of each u (n, d), up to a constant, (n,)."""
+        data = np.sum(self.errors(u) ** 2, axis=(1, 2, 3))
+        return 0.5 * (data + np.sum((u / self.hypothesis.prior_std) ** 2, axis=1))
+
+    def jacobian(self, u: Array, columns: list[int], difference: float = _DIFFERENCES[-1]) -> Array:
         """Derivative of the whitened errors by some of u (d,), (m, k), from both sides as far as bounds allow."""
         ends = np.tile(u, (2, len(columns), 1))
-        both = np.array([[-_DIFFERENCE], [_DIFFERENCE]])
+        both = np.array([[-difference], [difference]])
         reached = np.clip(u[columns] + both, self.hypothesis.low[columns], self.hypothesis.high[columns])
         ends[:, np.arange(len(columns)), columns] = reached
         below, above = self.errors(ends.reshape(-1, len(u))).reshape(2, len(columns), -1)
@@ -170,26 +173,27 @@ def fit(misfit: Misfit, start: Array, iterations: int, known: Array | None = Non
         u = np.clip(columns.T, hypothesis.low, hypothesis.high)
         return np.hstack([misfit.errors(u).reshape(len(u), -1), u / hypothesis.prior_std]).T
 
-    def jacobian(u: Array, _: Array | None = None) -> Array:
-        u = np.ravel(u)
-        differences = misfit.jacobian(u, fresh)
+    def jacobian(u: Array, difference: float) -> Array:
+        differences = misfit.jacobian(u, fresh, difference)
         data = differences if known is None else np.hstack([known, differences])
         return np.vstack([data, np.diag(1 / hypothesis.prior_std)])
 
-    u, _ = minimize.least_squares(
-        np.clip(start, hypothesis.low, hypothesis.high),
-        residual,
-        bounds=[hypothesis.low, hypothesis.high],
-        jacobian=jacobian,
-        norm=_HalfSquares(),
-        xtol=1e-2,
-        x_scale="jac",  # damping relative to what the data say of each coordinate
-        mu_min=1e-3,
-        mu_max=1e4,
-        mu_factor=10.0,
-        max_iter=iterations,
-        verbose=minimize.Verbosity.SILENT,
-    )
-    u = np.ravel(u)
+    u = np.clip(start, hypothesis.low, hypothesis.high)
+    for difference in _DIFFERENCES:
+        u, _ = minimize.least_squares(
+            u,
+            residual,
+            bounds=[hypothesis.low, hypothesis.high],
+            jacobian=lambda u, _, difference=difference: jacobian(np.ravel(u), difference),
+            norm=_HalfSquares(),
+            xtol=1e-2,
+            x_scale="jac",  # damping relative to what the data say of each coordinate
+            mu_min=1e-3,
+            mu_max=1e4,
+            mu_factor=10.0,
+            max_iter=iterations,
+            verbose=minimize.Verbosity.SILENT,
+        )
+        u = np.ravel(u)
     errors = misfit.errors(u[None])[0]
-    return Fit(u, errors.reshape(shape), jacobian(u)[: -len(u)], hypothesis.prior_std)
+    return Fit(u, errors.reshape(shape), jacobian(u, _DIFFERENCES[-1])[: -len(u)], hypothesis.prior_std)

@@ -15,9 +15,10 @@ from simopt_envs.engine import Engine, LocalEngine
 from simopt_envs.gap.fit import Fit, Misfit, fit
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
 from simopt_envs.gap.kept import kept_fits, key_of
+from simopt_envs.gap.large import of_some_size
 from simopt_envs.gap.plain import SPEAKS_FOR, Plain
 from simopt_envs.gap.selection import Score, chosen, left_by, score_of, worth_of
-from simopt_envs.gap.thresholds import COARSE, FAR, MOST_EFFECTS, REFITTED
+from simopt_envs.gap.thresholds import COARSE, FAR, LARGE, LARGE_REFITTED, MOST_EFFECTS, REFITTED
 from simopt_envs.gap.trial import Base, Data, Screened, Trial
 from simopt_envs.measured.windows import Windows
 from simopt_envs.physics.effects import Motion
@@ -29,8 +30,8 @@ Progress = Callable[[str, int, int], None]
 _ITERATIONS = 10
 _STEPS = np.array([1.0, 0.3, 0.1, 0.03])  # shares of the screen's step that a fit may start from
 _WORTH_A_START = 0.2  # share of the best probe's gain at which a fit may start from another one
-_SIZES = np.array([-30.0, -10.0, -3.0, -1.0, 1.0, 3.0, 10.0, 30.0])  # probes, of effects that may be large
 _FURTHEST = 20.0  # probes that the screen's step may be long
+_WINDOWS_OF_LARGE = 4  # that candidates of several sizes are tried on
 _BETTER = 2.0  # nats by which a base must become better for its candidates to be fitted anew
 
 
@@ -141,8 +142,12 @@ class Search:
             screened.append(self.screen(base, candidate))
         screened.sort(key=lambda s: -s.gain)
         spoken_for = self._spoken_for(base)
-        promising = screened[:REFITTED] + [s for s in screened[REFITTED:] if s.candidate in spoken_for]
-        trials = self.trials(base, [_Refit(one, one.candidate in spoken_for) for one in promising])
+        wanted = [*spoken_for, *self._large(base, screened)]
+        promising = screened[:REFITTED] + [s for s in screened[REFITTED:] if s.candidate in wanted]
+        afresh = (_afresh(base),)
+        everywhere = afresh if base.excess > LARGE else ()
+        far = {candidate: (start, *afresh) for candidate, start in spoken_for.items()}
+        trials = self.trials(base, [_Refit(one, far.get(one.candidate, everywhere)) for one in promising])
         if polish and (better := self._polished(base, trials)) is not None:
             return self.stage(better, polish=False)
         best = min(trials, key=lambda trial: trial.fit.loss + 0.5 * np.sum((trial.held_out / base.tolerance) ** 2))
@@ -170,8 +175,11 @@ class Search:
         probes[:, : len(base.fit.u)] = base.fit.u
         residual, (orthonormal, triangle) = base.fit.residual, base.fit.orthonormal
         found: list[Screened] = []
-        for probe, errors in zip(probes, misfit.errors(probes), strict=True):
-            change = np.concatenate([errors.ravel() - base.fit.errors.ravel(), np.zeros(len(base.fit.u))])
+        without = neutral.copy()
+        without[: len(base.fit.u)] = base.fit.u
+        errors = misfit.errors(np.concatenate([without[None], probes]))  # a structure alone changes a little
+        for probe, change_of_data in zip(probes, errors[1:] - errors[0], strict=True):
+            change = np.concatenate([change_of_data.ravel(), np.zeros(len(base.fit.u))])
             absorbed = orthonormal.T @ change
             direction = change - orthonormal @ absorbed
             size, slope = float(direction @ direction), float(direction @ residual)
@@ -186,12 +194,26 @@ class Search:
         promising = [s.starts for s in found if s.gain >= _WORTH_A_START * best.gain]
         return replace(best, starts=np.concatenate(promising))
 
+    def _large(self, base: Base, screened: Sequence[Screened]) -> list[Candidate]:
+        """The candidates that come nearest to the data at some size, where the base is far from them.
+
+        The other parameters are at the priors' means, as the base may be bent, and few windows tell that much.
+        """
+        if base.excess < LARGE:
+            return []
+        rows = np.argsort(-np.sum(base.fit.errors**2, axis=(1, 2)), kind="stable")[:_WINDOWS_OF_LARGE]
+        windows, noise = self.data.fitted.select(rows), base.noise.select(rows)
+        start, losses = _afresh(base), []
+        for done, one in enumerate(screened):
+            self._progress("try sizes of", done, len(screened))
+            misfit = Misfit(one.hypothesis, windows).with_noise(noise)
+            own = np.concatenate([start, one.hypothesis.neutral()[len(start) :]])
+            losses.append(misfit.losses(of_some_size(misfit, one.candidate, own)[None])[0])
+        return [screened[i].candidate for i in np.argsort(losses, kind="stable")[:LARGE_REFITTED]]
+
     def trials(self, base: Base, refits: Sequence[_Refit]) -> list[Trial]:
         """Candidates fitted, each together with all that the base has."""
-        keys = [
-            key_of(r.screened.hypothesis, base.fit.u, base.noise.scale, r.screened.starts, np.array(r.spoken_for))
-            for r in refits
-        ]
+        keys = [key_of(r.screened.hypothesis, base.fit.u, base.noise.scale, r.screened.starts, *r.far) for r in refits]
         todo = [i for i, key in enumerate(keys) if not self._kept.has(key)]
         done = itertools.count(len(refits) - len(todo) + 1)
         self._progress("refit", len(refits) - len(todo), len(refits))
@@ -215,15 +237,19 @@ class Search:
         key = key_of(misfit.hypothesis, start, misfit.noise.scale)
         return Fit(**self._kept.phase(key, lambda: vars(fit(misfit, start, _ITERATIONS))))
 
-    def _spoken_for(self, base: Base) -> list[Candidate]:
-        """The candidates that plain parameters far outside their priors speak for; a linear screen cannot tell them."""
+    def _spoken_for(self, base: Base) -> dict[Candidate, Array]:
+        """The candidates that plain parameters far outside their priors speak for; a linear screen cannot tell them.
+
+        Each with the base's coordinates (d,), but those parameters at their priors' means.
+        """
         plain = base.hypothesis.num_plain
-        far = np.flatnonzero(np.abs(base.fit.u[:plain]) > FAR)
-        names = [base.hypothesis.space.names[i].partition(".") for i in far]
-        wanted = [(SPEAKS_FOR[kind], name) for kind, _, name in names if kind in SPEAKS_FOR]
-        return [
-            c for c in self.candidates for effect, name in wanted if c.effect.name == effect and c.place.endswith(name)
-        ]
+        starts: dict[Candidate, Array] = {}
+        for i in np.flatnonzero(np.abs(base.fit.u[:plain]) > FAR):
+            kind, _, name = base.hypothesis.space.names[i].partition(".")
+            for c in self.candidates:
+                if c.effect.name == SPEAKS_FOR.get(kind) and c.place.endswith(name):
+                    starts.setdefault(c, base.fit.u.copy())[i] = 0.0
+        return starts
 
     def _eliminated(self, base: Base) -> Base:
         """Without the effects that the others have made needless, one after another."""
@@ -240,10 +266,15 @@ class Search:
 
 @dataclass(frozen=True, repr=False)
 class _Refit:
-    """A task: to fit a candidate, which plain parameters far from their priors may speak for."""
+    """A task: to fit a candidate.
+
+    Attributes:
+        screened: the candidate.
+        far: coordinates of the base (d,) from which the candidate is fitted too, at the size that it then needs.
+    """
 
     screened: Screened
-    spoken_for: bool = False
+    far: tuple[Array, ...] = ()
 
     def __repr__(self) -> str:
         return str(self.screened.candidate)
@@ -252,37 +283,24 @@ class _Refit:
 def _fitted(refit: _Refit, base: Base, fitted: Windows, held_out: Windows, num_threads: int) -> Result:
     """The fit of a candidate, and its errors on what was held out; near the base, its derivatives are taken as known.
 
-    Where plain parameters far from their priors speak for the candidate, it is fitted from the priors' means too: a
-    base that they have bent is the end of a valley that leads away from the right one.
+    Where the base is far from the data or from its priors, the candidate is fitted at the size that it would need, too:
+    with what speaks for it taken away, and with all plain parameters at their priors' means. A base that an effect has
+    bent is the end of a valley that leads away from the right one.
     """
     screened, hypothesis = refit.screened, refit.screened.hypothesis
     misfit = Misfit(hypothesis, fitted, num_threads).with_noise(base.noise)
-    start, of_base = hypothesis.neutral(), len(base.fit.u)
-    start[base.hypothesis.num_plain : of_base] = base.fit.u[base.hypothesis.num_plain :]
-    fresh = _sized(screened, start, of_base)
-    start[:of_base] = base.fit.u
-    nearby = misfit.best(screened.starts)
-    best = misfit.best(np.concatenate([nearby[None], _sized(screened, start, of_base), fresh]))
-    known = base.fit.jacobian if np.array_equal(best, nearby) else None  # far from the base it is another
-    found = fit(misfit, best, _ITERATIONS, known=known)
-    if refit.spoken_for:
-        other = fit(misfit, misfit.best(fresh), _ITERATIONS)
-        found = min(found, other, key=lambda f: f.loss)
+    fits = [fit(misfit, misfit.best(screened.starts), _ITERATIONS, known=base.fit.jacobian)]
+    for u in refit.far:
+        start = np.concatenate([u, hypothesis.neutral()[len(u) :]])
+        fits.append(fit(misfit, of_some_size(misfit, screened.candidate, start), _ITERATIONS))
+    found = min(fits, key=lambda f: f.loss)
     test = Misfit(hypothesis, held_out, num_threads).with_noise(base.held_out_noise)
     return {**vars(found), "held_out": base.tolerance * test.errors(found.u[None])[0]}
 
 
-def _sized(screened: Screened, start: Array, of_base: int) -> Array:
-    """Starts with a candidate of several sizes, the first so many coordinates as in a start (d,): (k, d).
-
-    A large effect is far beyond what a linear screen can tell of its size.
-    """
-    hypothesis, amounts = screened.hypothesis, screened.hypothesis.amounts(screened.candidate)
-    probes = hypothesis.probes(screened.candidate)
-    probes[:, :of_base] = start[:of_base]
-    sized = np.tile(probes, (len(_SIZES), 1, 1))
-    sized[..., amounts] = start[amounts] + _SIZES[:, None, None] * (probes[:, amounts] - start[amounts])
-    return np.clip(sized.reshape(-1, len(start)), hypothesis.low, hypothesis.high)
+def _afresh(base: Base) -> Array:
+    """The base's coordinates (d,), its plain parameters at their priors' means."""
+    return np.where(np.arange(len(base.fit.u)) < base.hypothesis.num_plain, 0.0, base.fit.u)
 
 
 def _clipped(step: float, shift: Array, neutral: Array, hypothesis: Hypothesis, columns: list[int]) -> float:

@@ -35,6 +35,12 @@ FAR = 3.5
 REFITTED = 6
 """Candidates of the screen that are fitted."""
 
+LARGE = 10.0
+"""Mean square of the whitened held-out errors, above noise, from which effects are tried at several sizes too."""
+
+LARGE_REFITTED = 3
+"""Candidates that are fitted for what they are worth at one of these sizes."""
+
 COARSE = 3.0
 """Times the sensors' noise, left by the best candidate in a channel, from which fits count errors in what is left."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
@@ -53,6 +53,13 @@ class Windows:
     def names(self) -> tuple[str, ...]:
         """Names of the compared columns."""
         return tuple(channel.name for channel in self.channels)
+
+    def select(self, rows: NDArray[np.intp]) -> Windows:
+        """Some of them, in the order given."""
+        names = ("start_time", "measured", "commands", "past_commands")
+        taken = {name: getattr(self, name)[rows] for name in names}
+        recording = tuple(self.recording[row] for row in rows)
+        return replace(self, recording=recording, starts=self.starts.select(rows), **taken)
 
     def channel_scale(self) -> Array:
         """Standard deviation of each channel over all windows, (c,): what normalised errors are relative to."""

@@ -1,0 +1,97 @@
+"""A model with an effect in it: nothing changes while there is none of it, and it starts where the effect lets it."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+from conftest import needs_effects
+from gap_plant import MODEL, record
+
+from simopt_envs.gap.fit import Misfit
+from simopt_envs.gap.hypothesis import Candidate, Hypothesis
+from simopt_envs.gap.large import of_some_size
+from simopt_envs.gap.motion import motion_of
+from simopt_envs.gap.plain import plain_parameters
+from simopt_envs.gap.recordings import read_windows
+from simopt_envs.measured import Recording
+from simopt_envs.physics.effects import EFFECTS
+from simopt_envs.physics.parameters import ParameterSpace
+from simopt_envs.physics.writer import ModelWriter
+
+pytestmark = needs_effects
+
+
+_SOFT = ("backlash", "load_dependent_friction")
+
+
+@pytest.fixture(scope="module")
+def arm():
+    """Plain parameters, windows and motion of an arm with strong dry friction in its shoulder."""
+    plain = plain_parameters(mujoco.MjSpec.from_string(MODEL))
+    recordings = record(lambda q, v: np.array([-4.0 * np.tanh(v[0] / 0.01), 0.0]), np.random.default_rng(0))
+    return plain, read_windows(plain.model, recordings, None), motion_of(plain.model, recordings, None)
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_without_any_of_an_effect_every_column_is_as_without_its_structure(arm, name):
+    plain, data, motion = arm
+    without = Hypothesis(plain, (), motion)
+    expected = without.simulator(data.fitted)(without.xi(without.neutral()[None]))
+    for place in EFFECTS[name].places(plain.model)[:1]:  # the first joint: those after it move up
+        hypothesis = Hypothesis(plain, [Candidate(EFFECTS[name], place)], motion)
+        simulated = hypothesis.simulator(data.fitted)(hypothesis.xi(hypothesis.neutral()[None]))
+        # A stop that counts as rigid, and the shoes of a brake, give by a little under the load.
+        np.testing.assert_allclose(simulated, expected, atol=5e-3 if name in _SOFT else 3e-4)
+
+
+@pytest.mark.parametrize(("name", "value"), [("joint_elasticity", 60.0), ("backlash", 0.03)])
+def test_a_link_starts_where_it_rests_under_its_load(name, value):
+    plain = plain_parameters(mujoco.MjSpec.from_string(MODEL))
+    candidate = Candidate(EFFECTS[name], "joint:shoulder")
+    steady = _at_rest(plain.spec, candidate, value)
+    data, motion = read_windows(plain.model, steady, None), motion_of(plain.model, steady, None)
+    hypothesis = Hypothesis(plain, [candidate], motion)
+    xi = hypothesis.space.nominal.copy()
+    xi[hypothesis.columns[candidate]] = value
+    simulated = hypothesis.simulator(data.fitted)(xi[None])[0]
+    rest, stiff = (np.abs(s - data.fitted.measured).max() for s in (simulated, _rigid(plain, data, motion)))
+    assert rest < 3e-4
+    assert stiff > 20 * rest  # a link that did not give would show its tip elsewhere
+
+
+def test_a_large_effect_is_tried_at_about_its_size(arm):
+    plain, data, motion = arm
+    candidate = Candidate(EFFECTS["coulomb_friction"], "joint:shoulder")
+    hypothesis = Hypothesis(plain, [candidate], motion)
+    misfit = Misfit(hypothesis, data.fitted)
+    found = of_some_size(misfit, candidate, hypothesis.neutral())
+    (friction,) = hypothesis.values(candidate, hypothesis.xi(found[None])[0]).values()
+    assert friction == pytest.approx(4.0, rel=0.2)
+
+
+def _rigid(plain, data, motion):
+    hypothesis = Hypothesis(plain, (), motion)
+    return hypothesis.simulator(data.fitted)(hypothesis.space.nominal[None])[0]
+
+
+def _at_rest(spec: mujoco.MjSpec, candidate: Candidate, value: float) -> list[Recording]:
+    """Recordings of the arm held still, with the effect."""
+    spec = spec.copy()
+    candidate.effect.add(spec, candidate.place)
+    model = spec.compile()
+    (parameter,) = candidate.effect.parameters(model, candidate.place)
+    data = mujoco.MjData(model)
+    ModelWriter(model, ParameterSpace([parameter])).write_model(np.array([value]), model, data)
+    recordings = []
+    for number, posture in enumerate([[0.2, 0.1], [-0.3, 0.4]]):
+        mujoco.mj_resetData(model, data)
+        data.ctrl[:] = posture
+        for _ in range(5000):
+            mujoco.mj_step(model, data)
+        time = np.arange(60) * 0.02
+        columns = {f"ctrl/{j}": posture[i] for i, j in enumerate(("shoulder", "elbow"))}
+        columns |= {f"qpos/{j}": data.joint(j).qpos[0] for j in ("shoulder", "elbow")}
+        columns |= {f"site/tip/{a}": data.site("tip").xpos[i] for i, a in enumerate("xyz")}
+        recordings.append(Recording(time, {k: np.full(60, v) for k, v in columns.items()}, f"still_{number}"))
+    return recordings
