@@ -6,6 +6,7 @@ of the sensors and the covariance S P₀ Sᵀ that uncertain starts leave in a w
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -20,7 +21,7 @@ from simopt_envs.physics.parameters import Array
 
 # Of a unit of u, to both sides, one after another. Contacts and dry friction make predictions kink: derivatives over
 # less tell of one kink and lead a fit astray, those over much lead it across them and past where laws bend.
-_DIFFERENCES = (1.0, 0.3, 0.1)
+DIFFERENCES = (1.0, 0.3, 0.1)
 _KINK = 6.0  # medians: four standard deviations
 _DIVERGED = 30.0  # the error, in units of noise, of a sample that a simulation did not reach
 
@@ -118,7 +119,7 @@ class Misfit:
         data = np.sum(self.errors(u) ** 2, axis=(1, 2, 3))
         return 0.5 * (data + np.sum((u / self.hypothesis.prior_std) ** 2, axis=1))
 
-    def jacobian(self, u: Array, columns: list[int], difference: float = _DIFFERENCES[-1]) -> Array:
+    def jacobian(self, u: Array, columns: list[int], difference: float = DIFFERENCES[-1]) -> Array:
         """Derivative of the whitened errors by some of u (d,), (m, k), from both sides as far as bounds allow."""
         ends = np.tile(u, (2, len(columns), 1))
         both = np.array([[-difference], [difference]])
@@ -155,7 +156,13 @@ class _HalfSquares(minimize.Norm):
         return np.einsum("im,mk->ik", columns, r), np.einsum("im,jm->ij", columns, columns)
 
 
-def fit(misfit: Misfit, start: Array, iterations: int, known: Array | None = None) -> Fit:
+def fit(
+    misfit: Misfit,
+    start: Array,
+    iterations: int,
+    known: Array | None = None,
+    differences: Sequence[float] = DIFFERENCES,
+) -> Fit:
     """The most probable u.
 
     Args:
@@ -164,6 +171,7 @@ def fit(misfit: Misfit, start: Array, iterations: int, known: Array | None = Non
         iterations: of Gauss-Newton with Levenberg's damping, at most.
         known: the Jacobian by the first k of u, (m, k), where it is known well enough from a fit nearby: it saves the
             most of the work. None to take all by differences.
+        differences: over which derivatives are taken, one after another; from a start that is a fit, fine ones do.
     """
     hypothesis = misfit.hypothesis
     fresh = list(range(0 if known is None else known.shape[1], len(start)))
@@ -174,12 +182,12 @@ def fit(misfit: Misfit, start: Array, iterations: int, known: Array | None = Non
         return np.hstack([misfit.errors(u).reshape(len(u), -1), u / hypothesis.prior_std]).T
 
     def jacobian(u: Array, difference: float) -> Array:
-        differences = misfit.jacobian(u, fresh, difference)
-        data = differences if known is None else np.hstack([known, differences])
+        taken = misfit.jacobian(u, fresh, difference)
+        data = taken if known is None else np.hstack([known, taken])
         return np.vstack([data, np.diag(1 / hypothesis.prior_std)])
 
     u = np.clip(start, hypothesis.low, hypothesis.high)
-    for difference in _DIFFERENCES:
+    for difference in differences:
         u, _ = minimize.least_squares(
             u,
             residual,
@@ -196,4 +204,4 @@ def fit(misfit: Misfit, start: Array, iterations: int, known: Array | None = Non
         )
         u = np.ravel(u)
     errors = misfit.errors(u[None])[0]
-    return Fit(u, errors.reshape(shape), jacobian(u, _DIFFERENCES[-1])[: -len(u)], hypothesis.prior_std)
+    return Fit(u, errors.reshape(shape), jacobian(u, differences[-1])[: -len(u)], hypothesis.prior_std)

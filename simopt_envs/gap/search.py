@@ -12,7 +12,7 @@ import numpy as np
 
 from simopt_envs.adaptation.checkpoint import Result
 from simopt_envs.engine import Engine, LocalEngine
-from simopt_envs.gap.fit import Fit, Misfit, fit
+from simopt_envs.gap.fit import DIFFERENCES, Fit, Misfit, fit
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
 from simopt_envs.gap.kept import kept_fits, key_of
 from simopt_envs.gap.large import of_some_size
@@ -119,17 +119,17 @@ class Search:
     def base(self, effects: Sequence[Candidate] = (), start: Array | None = None) -> Base:
         """The hypothesis of some effects, fitted with all its differences."""
         hypothesis = Hypothesis(self.plain, effects, self.motion)
-        u = hypothesis.neutral() if start is None else start
+        u, differences = (hypothesis.neutral(), DIFFERENCES) if start is None else (start, DIFFERENCES[1:])
         fitted, held_out = (Misfit(hypothesis, w) for w in (self.data.fitted, self.data.held_out))
         if self._floor is None:  # what the first fit leaves is nearer to noise alone than what the model as given does
             self._progress("fit", 0, 2)
             floor = fitted.noise_floor(u)
-            u = self._fit(fitted.with_noise(fitted.noise_at(u, floor)), u).u
+            u = self._fit(fitted.with_noise(fitted.noise_at(u, floor)), u, differences).u
             self._floor = np.minimum(floor, fitted.noise_floor(u))
         self._progress("fit", 1, 2)
         scale = self._floor * self._tolerance
         noise, held_out_noise = fitted.noise_at(u, scale), held_out.noise_at(u, scale)
-        found = self._fit(fitted.with_noise(noise), u)
+        found = self._fit(fitted.with_noise(noise), u, differences)
         errors = self._tolerance * held_out.with_noise(held_out_noise).errors(found.u[None])[0]
         return Base(hypothesis, found, errors, noise, held_out_noise, self._tolerance)
 
@@ -161,10 +161,9 @@ class Search:
         Or what a candidate's fit found, and the base's had missed, would count as the candidate's merit.
         """
         misfit = Misfit(base.hypothesis, self.data.fitted).with_noise(base.noise)
-        found = self._fit(misfit, misfit.best(np.array([trial.fit.u[: len(base.fit.u)] for trial in trials])))
-        if found.loss > base.fit.loss - _BETTER:
-            return None
-        return self.base(base.hypothesis.candidates, found.u)
+        start = misfit.best(np.array([trial.fit.u[: len(base.fit.u)] for trial in trials]))
+        found = self.base(base.hypothesis.candidates, start)
+        return found if misfit.losses(found.fit.u[None])[0] < base.fit.loss - _BETTER else None
 
     def screen(self, base: Base, candidate: Candidate) -> Screened:
         """What a candidate would gain if its best probe acted linearly."""
@@ -232,10 +231,10 @@ class Search:
             trials.append(Trial(refit.screened.hypothesis, Fit(**arrays), held_out))
         return trials
 
-    def _fit(self, misfit: Misfit, start: Array) -> Fit:
-        """A fit of all differences."""
-        key = key_of(misfit.hypothesis, start, misfit.noise.scale)
-        return Fit(**self._kept.phase(key, lambda: vars(fit(misfit, start, _ITERATIONS))))
+    def _fit(self, misfit: Misfit, start: Array, differences: Sequence[float]) -> Fit:
+        """A fit of all parameters."""
+        key = key_of(misfit.hypothesis, start, misfit.noise.scale, np.array(differences))
+        return Fit(**self._kept.phase(key, lambda: vars(fit(misfit, start, _ITERATIONS, differences=differences))))
 
     def _spoken_for(self, base: Base) -> dict[Candidate, Array]:
         """The candidates that plain parameters far outside their priors speak for; a linear screen cannot tell them.
