@@ -269,11 +269,11 @@ def test_a_candidate_whose_fit_fails_is_named_and_the_others_need_not_be_fitted_
 
     fitted, broken, real = [], "actuator_bias at actuator:elbow", search.fit
 
-    def fit(misfit, start, iterations, known=None):
+    def fit(misfit, start, iterations, **options):
         fitted.append(" and ".join(map(str, misfit.hypothesis.candidates)))
         if fitted[-1] == broken:
             raise np.linalg.LinAlgError("singular")
-        return real(misfit, start, iterations, known)
+        return real(misfit, start, iterations, **options)
 
     def find(found_in, recordings=recordings):
         fitted.clear()

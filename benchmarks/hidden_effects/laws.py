@@ -356,10 +356,11 @@ class Transmission(AtJoint):
         drive = list(world.dof).index(self._dof)
         if not hasattr(self, "_inertia"):
             self._inertia = float(world.model.dof_armature[self._dof])
+            self._link_share = 1 - self._inertia / float(world.model.dof_M0[self._dof])
             world.model.dof_armature[self._dof] = 0
+            mujoco.mj_setConst(world.model, mujoco.MjData(world.model))  # a single slide's inertia is a constant
         world.rotors[drive] = Rotor(self._inertia, self._torque, q, v)
         self._drive, self._fresh = drive, True
-        self._link_share = 1 - self._inertia / (world.model.dof_M0[self._dof])
 
     def drive(self, world: World) -> None:
         """Before the first step the transmission is twisted as it is when rotor and link speed up together."""

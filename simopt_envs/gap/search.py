@@ -257,6 +257,8 @@ class Search:
             others = [e for e in effects if e != effect]
             without = self.base(others, base.hypothesis.without(effect, base.fit.u))
             screened = self.screen(without, effect)
+            as_it_was = screened.hypothesis.of_another(base.hypothesis, base.fit.u)
+            screened = replace(screened, starts=np.concatenate([screened.starts, as_it_was[None]]))
             (with_it,) = self.trials(without, [_Refit(screened)])
             if not score_of(without, screened, with_it, worth_of(with_it)).earned:
                 return self._eliminated(without)
