@@ -23,7 +23,7 @@ import numpy as np
 from benchmarks.hidden_effects.catalogue import EFFECTS, Effect
 from benchmarks.hidden_effects.outside import OUTSIDE
 from benchmarks.hidden_effects.plants import RECORDINGS, Array, Motion, Plant, nominal_model, plants
-from benchmarks.hidden_effects.truth import Diverged, Law, Run, World, plain_parameters
+from benchmarks.hidden_effects.truth import HALF_STEP_LEAD, MAX_LATENCY, Diverged, Law, Run, World, plain_parameters
 
 FILE = Path(__file__).with_name("detectable.json")
 SIGMAS = 5.0
@@ -74,13 +74,14 @@ class Observability:
 
     def __init__(self, plant: Plant, seed: int = 0):
         self.plant = plant
-        self._plain = {"latency": 1e-3}
+        self._plain = {"latency": (HALF_STEP_LEAD + MAX_LATENCY) / 2}
         self._stretches = self._cut(np.random.default_rng(seed))
         self._base = self._columns(())
         starts = self._start_sensitivity()
         self._starts = starts
         self._deviations = plain_parameters(plant)
-        self._furthest = np.array([np.sqrt(3) if name == "latency" else 3.0 for name in self._deviations])
+        latest = (MAX_LATENCY - HALF_STEP_LEAD) / 2 / self._deviations["latency"]
+        self._furthest = np.array([latest if name == "latency" else 3.0 for name in self._deviations])
         self._slopes = np.stack([self._slope(unit) for unit in np.eye(len(self._deviations))], axis=1)
 
     def direction(self, law: Law) -> Array:
@@ -145,7 +146,8 @@ class Observability:
 
     def _slope(self, unit: Array, step: float = 0.1) -> Array:
         """Derivative by a plain parameter, over a tenth of its deviation from both sides: over the whole the curvature,
-        hundreds of sigmas where the noise is small, would count as what no plain parameter explains."""
+        hundreds of sigmas where the noise is small, would count as what no plain parameter explains.
+        """
         return (self._changed((), step * unit) - self._changed((), -step * unit)) / (2 * step)
 
     def _start_sensitivity(self) -> list[Array]:
