@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -76,8 +77,20 @@ def find_gap(
     data = read_windows(start.model, read, keyframe)
     motion = motion_of(start.model, read, keyframe)
     seen = tuple(c for effect in effects for c in _places(effect, start.model) if _shows(c, start.model, data.fitted))
-    explanation = Search(start, data, motion, seen, progress, engine, directory).run()
-    return _gap(given, explanation, data, keyframe, began)
+    with _silent_warnings():
+        explanation = Search(start, data, motion, seen, progress, engine, directory).run()
+        return _gap(given, explanation, data, keyframe, began)
+
+
+@contextmanager
+def _silent_warnings() -> Iterator[None]:
+    """Keep MuJoCo from writing of each simulation that runs away: a search tries some that do, and notices itself."""
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda _: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
 
 
 def _gap(given: mujoco.MjSpec, explanation: Explanation, data: Data, keyframe: str | None, began: float) -> Gap:
