@@ -35,7 +35,7 @@ SIMILAR = 0.9
 """The table lists others from here up."""
 
 
-FREE = 1000.0
+FREE = 1e6
 """Standard deviations of the sensors' noise to which a start is known beforehand: as good as not at all. (A start that
 is known lets a shifted reading show where it shifts the start as well.)"""
 

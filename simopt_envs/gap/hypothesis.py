@@ -129,13 +129,6 @@ class Hypothesis:
         """Coordinates (d,) with those of one candidate left out."""
         return np.delete(u, self.columns[candidate])
 
-    def of_another(self, other: Hypothesis, u: Array) -> Array:
-        """Coordinates (d,) of a hypothesis with the same effects in another order, in the order of this one."""
-        moved = u.copy()
-        for candidate, columns in self.columns.items():
-            moved[columns] = u[other.columns[candidate]]
-        return moved
-
     def simulator(self, windows: Windows, num_threads: int = 0) -> HypothesisSimulator:
         """A simulator of windows for values of ξ, on one thread per core by default."""
         return HypothesisSimulator(self, windows, num_threads)

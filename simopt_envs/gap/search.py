@@ -152,7 +152,7 @@ class Search:
             return self.stage(better, polish=False)
         best = min(trials, key=lambda trial: trial.fit.loss + 0.5 * np.sum((trial.held_out / base.tolerance) ** 2))
         worth = worth_of(best)
-        scores = [score_of(base, s, t, worth) for s, t in zip(promising, trials, strict=True)]
+        scores = [score_of(base, s.candidate, t, worth) for s, t in zip(promising, trials, strict=True)]
         return Stage(base, tuple(screened), tuple(sorted(scores, key=lambda score: -score.total)))
 
     def _polished(self, base: Base, trials: Sequence[Trial]) -> Base | None:
@@ -162,8 +162,8 @@ class Search:
         """
         misfit = Misfit(base.hypothesis, self.data.fitted).with_noise(base.noise)
         start = misfit.best(np.array([trial.fit.u[: len(base.fit.u)] for trial in trials]))
-        found = self.base(base.hypothesis.candidates, start)
-        return found if misfit.losses(found.fit.u[None])[0] < base.fit.loss - _BETTER else None
+        found = self._fit(misfit, start, DIFFERENCES[1:])
+        return self.base(base.hypothesis.candidates, found.u) if found.loss < base.fit.loss - _BETTER else None
 
     def screen(self, base: Base, candidate: Candidate) -> Screened:
         """What a candidate would gain if its best probe acted linearly."""
@@ -251,17 +251,21 @@ class Search:
         return starts
 
     def _eliminated(self, base: Base) -> Base:
-        """Without the effects that the others have made needless, one after another."""
+        """Without the effects that the others have made needless, one after another.
+
+        With and without are compared in one noise, that of the model with all: what uncertain starts leave depends on
+        the model too.
+        """
         effects = base.hypothesis.candidates
         for effect in effects if len(effects) > 1 else ():
-            others = [e for e in effects if e != effect]
-            without = self.base(others, base.hypothesis.without(effect, base.fit.u))
-            screened = self.screen(without, effect)
-            as_it_was = screened.hypothesis.of_another(base.hypothesis, base.fit.u)
-            screened = replace(screened, starts=np.concatenate([screened.starts, as_it_was[None]]))
-            (with_it,) = self.trials(without, [_Refit(screened)])
-            if not score_of(without, screened, with_it, worth_of(with_it)).earned:
-                return self._eliminated(without)
+            hypothesis = Hypothesis(self.plain, [e for e in effects if e != effect], self.motion)
+            misfit, test = (Misfit(hypothesis, windows) for windows in (self.data.fitted, self.data.held_out))
+            start = base.hypothesis.without(effect, base.fit.u)
+            found = self._fit(misfit.with_noise(base.noise), start, DIFFERENCES[1:])
+            errors = base.tolerance * test.with_noise(base.held_out_noise).errors(found.u[None])[0]
+            without = Base(hypothesis, found, errors, base.noise, base.held_out_noise, base.tolerance)
+            if not score_of(without, effect, base, worth_of(base)).earned:
+                return self._eliminated(self.base(hypothesis.candidates, found.u))
         return base
 
 

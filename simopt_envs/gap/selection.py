@@ -11,7 +11,7 @@ from simopt_envs.gap.fit import Fit
 from simopt_envs.gap.hypothesis import Candidate
 from simopt_envs.gap.plain import SPEAKS_FOR
 from simopt_envs.gap.thresholds import EVIDENCE, EVIDENCE_EACH, EXPLAINED, FAR, FURTHER, SIMPLER, SIMPLER_SHARE
-from simopt_envs.gap.trial import Base, Screened, Trial
+from simopt_envs.gap.trial import Base, Trial
 from simopt_envs.physics.parameters import Array
 
 
@@ -20,23 +20,18 @@ class Score:
     """What a candidate earns over the base, in nats.
 
     Attributes:
-        screened: by the linear screen.
+        candidate: the effect and its place.
         trial: its fit.
         fitted: gain on the fitted windows and the prior, less the price of its parameters (BIC).
         held_out: gain on the windows held out and the prior.
         of_prior: the part of both that plain parameters give back, as they need not stand in for the effect any more.
     """
 
-    screened: Screened
+    candidate: Candidate
     trial: Trial
     fitted: float
     held_out: float
     of_prior: float
-
-    @property
-    def candidate(self) -> Candidate:
-        """The effect and its place."""
-        return self.screened.candidate
 
     @property
     def total(self) -> float:
@@ -105,7 +100,7 @@ def left_by(best: Trial) -> Array:
     return 1 / np.sqrt(worth_of(best))
 
 
-def score_of(base: Base, screened: Screened, trial: Trial, worth: Array) -> Score:
+def score_of(base: Base, candidate: Candidate, trial: Trial, worth: Array) -> Score:
     """Gains in nats, each squared error counted by what it is worth."""
 
     def gain(before: Array, after: Array) -> float:
@@ -119,4 +114,4 @@ def score_of(base: Base, screened: Screened, trial: Trial, worth: Array) -> Scor
     of_prior = prior(base.fit) - prior(trial.fit)
     fitted = gain(base.tolerance * base.fit.errors, base.tolerance * trial.fit.errors) + of_prior - price
     held_out = gain(base.held_out, trial.held_out) + of_prior
-    return Score(screened, trial, float(fitted), float(held_out), of_prior)
+    return Score(candidate, trial, float(fitted), float(held_out), of_prior)
