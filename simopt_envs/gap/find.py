@@ -110,7 +110,7 @@ def _gap(given: mujoco.MjSpec, explanation: Explanation, data: Data, keyframe: s
     left = describe(final.hypothesis, final.fit.u, residuals)
     named = separate(named_effects(explained), explained, data, keyframe)
     seconds = time.perf_counter() - began
-    return Gap(verdict, named, errors, rows, left, explanation, data, spec, diff, seconds)
+    return Gap(verdict, named, errors, rows, left, explained, data, spec, diff, seconds)
 
 
 def _spec(model: str | Path | mujoco.MjSpec) -> mujoco.MjSpec:
