@@ -2,8 +2,9 @@
 
 They were set on development seeds of ``benchmarks/hidden_effects`` and frozen in commit 0bfec20, before its test seeds
 were first run. Changed since, with recordings of real hardware and development seeds in sight: ``SIMPLER_SHARE``,
-``COARSE``, ``LARGE`` and ``LARGE_REFITTED`` are new; ``FURTHER`` holds for every further effect, not only where the model counts as right; ``EVIDENCE``
-was 15 nats on the fitted and on the held-out windows each; and ``SIMPLER`` asked for so much on either, not held out.
+``COARSE``, ``LARGE`` and ``LARGE_REFITTED`` are new; ``FURTHER`` holds for every further effect, not only where the
+model counts as right; ``EVIDENCE`` was 15 nats on the fitted and on the held-out windows each; and ``SIMPLER`` asked
+for so much on either, not held out.
 """
 
 EVIDENCE = 20.0
