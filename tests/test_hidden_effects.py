@@ -1,6 +1,7 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -10,7 +11,7 @@ from conftest import needs_effects
 from benchmarks.hidden_effects import laws
 from benchmarks.hidden_effects.cases import FIRST_SEED, LEVELS, Case, Hidden, cases, table
 from benchmarks.hidden_effects.catalogue import EFFECTS
-from benchmarks.hidden_effects.detectability import reduced
+from benchmarks.hidden_effects.detectability import Observability, reduced
 from benchmarks.hidden_effects.generate import column_names, simulate, write_case
 from benchmarks.hidden_effects.outside import OUTSIDE
 from benchmarks.hidden_effects.plants import RECORDINGS, nominal_model, plants
@@ -244,3 +245,25 @@ def test_wilson_interval():
     low, high = Rate("", 9, 10).interval
     assert (low, high) == pytest.approx((0.5958, 0.9821), abs=1e-3)
     assert Rate("", 0, 0).interval == (0.0, 1.0)
+
+
+def test_what_a_plain_parameter_does_too_counts_by_its_prior():
+    plant = replace(plants()["slide_drive"], analysed=2)
+    observability = Observability(plant)
+    rng = np.random.default_rng(0)
+    heavier, _ = EFFECTS["armature"].build(plant, "carriage", 3.0, True, rng)
+    # 3 kg in standard deviations of mass (70 kg) and armature (25 kg) at 10 %, and of the drive's gain at 3 %
+    by_prior = 3.0 / np.sqrt(7.0**2 + 2.5**2 + (0.03 * 95) ** 2)
+    assert np.linalg.norm(observability.direction(heavier)) == pytest.approx(by_prior, rel=0.05)
+    rubbing, _ = EFFECTS["coulomb_friction"].build(plant, "carriage", 0.1, True, rng)
+    assert np.linalg.norm(observability.direction(rubbing)) > 20  # which no plain parameter does
+
+
+def test_a_stiff_transmission_counts_the_motors_inertia_once():
+    plant = plants()["slide_drive"]
+    motion = plant.motion(2, np.random.default_rng(1))
+    plain = World(plant).run(motion).columns
+    law, _ = EFFECTS["joint_elasticity"].build(plant, "carriage", 0.0, True, np.random.default_rng(0))
+    heavier = World(plant, (EFFECTS["armature"].build(plant, "carriage", 25.0, True, np.random.default_rng(0))[0],))
+    change = np.abs(World(plant, (law,)).run(motion).columns - plain).max()
+    assert change < 0.1 * np.abs(heavier.run(motion).columns - plain).max()

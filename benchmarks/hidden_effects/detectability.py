@@ -33,8 +33,6 @@ EQUIVALENT = 0.99
 """Effects whose projected directions correlate by this much cannot be told apart."""
 SIMILAR = 0.9
 """The table lists others from here up."""
-
-
 FREE = 1e6
 """Standard deviations of the sensors' noise to which a start is known beforehand: as good as not at all. (A start that
 is known lets a shifted reading show where it shifts the start as well.)"""
@@ -108,7 +106,7 @@ class Observability:
                 best = np.r_[change, x]
             if gained < 0.02 * np.linalg.norm(best):
                 break
-        return best * np.sqrt(RECORDINGS / self.plant.analysed)
+        return best
 
     def _cut(self, rng: np.random.Generator) -> list[Stretch]:
         world, stretches = World(self.plant, (), self._plain), []
@@ -139,14 +137,20 @@ class Observability:
         )
 
     def _changed(self, laws: Sequence[Law], moved: Array) -> Array:
-        """Whitened change of all columns under laws and with plain parameters moved by so many deviations, (n,)."""
+        """Whitened change of all columns under laws and with plain parameters moved by so many deviations, (n,).
+
+        What is analysed counts for all recordings.
+        """
         moves = {name: move * sd for move, (name, sd) in zip(moved, self._deviations.items(), strict=True)}
         plain = {name: self._plain.get(name, 0.0) + move for name, move in moves.items()}
-        return np.concatenate(self._whitened(self._columns(laws, plain)))
+        changes = np.concatenate(self._whitened(self._columns(laws, plain)))
+        return changes * np.sqrt(RECORDINGS / self.plant.analysed)
 
     def _slope(self, unit: Array, step: float = 0.1) -> Array:
-        """Derivative by a plain parameter, over a tenth of its deviation from both sides: over the whole the curvature,
-        hundreds of sigmas where the noise is small, would count as what no plain parameter explains.
+        """Derivative by a plain parameter, over a tenth of its deviation from both sides.
+
+        Over the whole, the curvature, hundreds of sigmas where noise is small, would count as what no plain parameter
+        explains.
         """
         return (self._changed((), step * unit) - self._changed((), -step * unit)) / (2 * step)
 
