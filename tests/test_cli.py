@@ -135,7 +135,7 @@ def test_interrupted_runs_say_how_to_go_on(workplace, capsys, monkeypatch):
     assert other_trainer.value.code == 2
 
 
-def test_adapt_a_model_to_recordings(workplace):
+def test_adapt_a_model_to_recordings(workplace, capsys):
     files = ("--data", "log.csv", "--parameters", "xi.yaml", "--out", "out")
     main(["adapt", "arm.xml", *files, "--iterations", "2", "--rollouts", "400"])
     result = json.loads((workplace / "out" / "result.json").read_text())
@@ -143,6 +143,8 @@ def test_adapt_a_model_to_recordings(workplace):
     assert after["median"]["friction"] == pytest.approx(0.08, rel=0.15)
     assert before["median"]["friction"] == pytest.approx(0.03)
     assert (workplace / "out" / "report.html").exists()
+    said = " ".join(capsys.readouterr().out.split())
+    assert "simopt-envs gap arm.xml --data log.csv --out out/gap" in said
 
 
 def test_inspect_and_replay(workplace, capsys):

@@ -171,7 +171,7 @@ class Adapt:
         else:
             display.say("looking for what p(ξ) cannot explain")
             try:
-                explained = explain(self.system, distributions, logs, folder, display.console)
+                explained = explain(self.system, distributions, logs, folder, display.console, self.where.make())
             except ValueError as error:
                 finding = f"What p(ξ) cannot explain could not be looked for: {error}"
             else:
@@ -231,6 +231,9 @@ class Adapt:
             findings = ["Nothing was held out, so nothing here shows what the model is worth on new data.", *findings]
         write_json(self.out / "result.json", result)
         conclude(self.out, findings, display)
+        logs = " ".join(map(str, self.data))
+        mapping = "" if self.mapping is None else f" --mapping {self.mapping}"
+        display.say(f"what no ξ explains: simopt-envs gap {self.system} --data {logs}{mapping} --out {self.out / _GAP}")
 
     def _update(self) -> Update:
         return REPS(epsilon=self.epsilon) if self.update == "reps" else CEM(epsilon=self.epsilon)

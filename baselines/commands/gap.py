@@ -22,6 +22,7 @@ from baselines.commands.inputs import distribution, existing, require_free
 from baselines.commands.parameter_file import read_parameters
 from baselines.commands.recordings import existing_logs
 from simopt_envs.distributions import Gaussian
+from simopt_envs.engine import Engine
 from simopt_envs.measured import Recording, load_recording
 from simopt_envs.physics import Parameter, ParameterSpace
 from simopt_envs.physics.spec_writer import write_spec
@@ -88,7 +89,12 @@ class Gap:
 
 
 def explain(
-    env_id: str, distributions: Sequence[Gaussian], logs: Sequence[Path], folder: Path, console: Console
+    env_id: str,
+    distributions: Sequence[Gaussian],
+    logs: Sequence[Path],
+    folder: Path,
+    console: Console,
+    engine: Engine | None = None,
 ) -> bool:
     """Find what an environment's model lacks, if p(ξ) leaves more of the logs of its episodes than noise.
 
@@ -103,6 +109,7 @@ def explain(
         folder: for ``gap.json``, ``report.html`` and the repaired model, if more than noise is left. What is there
             already is kept, and a search that was stopped goes on from its finished fits.
         console: shows the progress.
+        engine: fits the candidates; this process by default.
 
     Returns:
         Whether noise is all that is left.
@@ -124,7 +131,9 @@ def explain(
             if tried[-1][0] < EXPLAINED:
                 return True
         _, spec, plain = min(tried, key=lambda one: one[0])
-        gap = find_gap(spec, recordings, plain=plain, keyframe=_HOME, progress=show, directory=folder / _FITS)
+        gap = find_gap(
+            spec, recordings, plain=plain, keyframe=_HOME, progress=show, engine=engine, directory=folder / _FITS
+        )
     gap.save(folder)
     shutil.rmtree(folder / _FITS)
     return False
