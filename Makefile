@@ -26,12 +26,12 @@ experiments-quick: $(VENV)
 HIDDEN := out/hidden_effects
 COUNT ?=
 hidden-effects: $(VENV)
-	.venv/bin/python -m benchmarks.hidden_effects.generate --split test --out $(HIDDEN)/cases --labels $(HIDDEN)/labels
+	.venv/bin/python -m benchmarks.hidden_effects.generate --split test --plants two_link arm3 slide_drive --out $(HIDDEN)/cases --labels $(HIDDEN)/labels
 	.venv/bin/python -m benchmarks.hidden_effects.run --cases $(HIDDEN)/cases --out $(HIDDEN)/found $(if $(COUNT),--count $(COUNT))
 	.venv/bin/python -m benchmarks.hidden_effects.score --gaps $(HIDDEN)/found --labels $(HIDDEN)/labels --figure $(HIDDEN)/confusion.png
 
 hidden-effects-quick:
-	$(MAKE) hidden-effects COUNT=30
+	$(MAKE) hidden-effects COUNT=15
 
 lint: $(VENV)
 	.venv/bin/ruff check .
