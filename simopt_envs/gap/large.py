@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from simopt_envs.gap.fit import Misfit
-from simopt_envs.gap.hypothesis import Candidate
+from simopt_envs.gap.hypothesis import Candidate, Hypothesis
 from simopt_envs.physics.parameters import Array
 
 _SIZES = np.outer([-1.0, 1.0], [1.0, 3.0, 10.0, 30.0, 100.0, 300.0]).ravel()  # probes
@@ -14,18 +14,28 @@ _FINER = np.geomspace([0.4, 0.9], [2.5, 1.1], 9).T  # of the best so far: where 
 
 def of_some_size(misfit: Misfit, candidate: Candidate, start: Array) -> Array:
     """A start (d,) with the candidate at the size, and of the shape, that comes nearest to the data."""
-    hypothesis, amounts = misfit.hypothesis, misfit.hypothesis.amounts(candidate)
+    return of_fine_size(misfit, candidate, start, of_rough_size(misfit, candidate, start))
 
-    def scaled(tried: Array, sizes: Array) -> Array:
-        """Each of some coordinates (k, d) with so many times its amount of the effect."""
-        out = np.tile(tried, (len(sizes), 1, 1))
-        out[..., amounts] = start[amounts] + sizes[:, None, None] * (tried[:, amounts] - start[amounts])
-        return np.clip(out.reshape(-1, len(start)), hypothesis.low, hypothesis.high)
 
+def of_rough_size(misfit: Misfit, candidate: Candidate, start: Array) -> Array:
+    """The same, of sizes that are far apart."""
+    hypothesis = misfit.hypothesis
     probes = hypothesis.probes(candidate)
     others = np.setdiff1d(np.arange(len(start)), hypothesis.columns[candidate])
     probes[:, others] = start[others]
-    best = misfit.best(scaled(probes, _SIZES))
+    return misfit.best(_scaled(hypothesis, candidate, start, probes, _SIZES))
+
+
+def of_fine_size(misfit: Misfit, candidate: Candidate, start: Array, rough: Array) -> Array:
+    """The same, of sizes near a rough one (d,)."""
     for sizes in _FINER:
-        best = misfit.best(scaled(best[None], sizes))
-    return best
+        rough = misfit.best(_scaled(misfit.hypothesis, candidate, start, rough[None], sizes))
+    return rough
+
+
+def _scaled(hypothesis: Hypothesis, candidate: Candidate, start: Array, tried: Array, sizes: Array) -> Array:
+    """Each of some coordinates (k, d) with so many times its amount of the effect, (sizes k, d)."""
+    amounts = hypothesis.amounts(candidate)
+    out = np.tile(tried, (len(sizes), 1, 1))
+    out[..., amounts] = start[amounts] + sizes[:, None, None] * (tried[:, amounts] - start[amounts])
+    return np.clip(out.reshape(-1, len(start)), hypothesis.low, hypothesis.high)

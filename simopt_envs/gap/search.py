@@ -11,11 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from simopt_envs.adaptation.checkpoint import Result
+from simopt_envs.adaptation.fitting import Noise
 from simopt_envs.engine import Engine, LocalEngine
 from simopt_envs.gap.fit import DIFFERENCES, Fit, Misfit, fit
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
 from simopt_envs.gap.kept import kept_fits, key_of
-from simopt_envs.gap.large import of_some_size
+from simopt_envs.gap.large import of_fine_size, of_rough_size, of_some_size
 from simopt_envs.gap.plain import SPEAKS_FOR, Plain
 from simopt_envs.gap.selection import Score, chosen, left_by, score_of, worth_of
 from simopt_envs.gap.thresholds import COARSE, FAR, LARGE, LARGE_REFITTED, MOST_EFFECTS, REFITTED
@@ -32,6 +33,7 @@ _STEPS = np.array([1.0, 0.3, 0.1, 0.03])  # shares of the screen's step that a f
 _WORTH_A_START = 0.2  # share of the best probe's gain at which a fit may start from another one
 _FURTHEST = 20.0  # probes that the screen's step may be long
 _WINDOWS_OF_LARGE = 4  # that candidates of several sizes are tried on
+_FINER = 4  # times as many candidates as are fitted at such a size are tried at finer ones
 _BETTER = 2.0  # nats by which a base must become better for its candidates to be fitted anew
 
 
@@ -98,21 +100,22 @@ class Search:
         self._kept = kept_fits(directory, plain, motion, data.fitted, data.held_out)
         self._floor: Array | None = None
         self._tolerance = np.ones(len(data.fitted.channels))
+        self._largest: dict[tuple[Candidate, ...], list[Candidate]] = {}
 
     def run(self) -> Explanation:
         """Add effects while they earn it, then take away those that the others have made needless."""
-        stages = [self.stage(self.base())]
-        left = left_by(min((score.trial for score in stages[0].scores), key=lambda trial: trial.excess))
+        stage = self.stage(self.base())
+        left = left_by(min((score.trial for score in stage.scores), key=lambda trial: trial.excess))
         if np.any(left > COARSE):  # only now it is known that nothing comes near the sensors' noise
             self._tolerance = left
-            stages = [self.stage(self.base())]
+            stage = self.stage(self.base(start=self._led_to(stage)))
+        stages = [self._polished(stage)]
         null = base = stages[0].base
         while (best := chosen(null, base, stages[-1].scores)) is not None:
-            self._tolerance = left_by(best.trial)
-            base = self.base([*base.hypothesis.candidates, best.candidate], best.trial.fit.u)
+            base = self._sharpened(best.trial)
             if len(base.hypothesis.candidates) == MOST_EFFECTS:
                 break
-            stages.append(self.stage(base))
+            stages.append(self._polished(self.stage(base)))
             base = stages[-1].base
         return Explanation(null, self._eliminated(base), tuple(stages))
 
@@ -133,8 +136,19 @@ class Search:
         errors = self._tolerance * held_out.with_noise(held_out_noise).errors(found.u[None])[0]
         return Base(hypothesis, found, errors, noise, held_out_noise, self._tolerance)
 
-    def stage(self, base: Base, polish: bool = True) -> Stage:
-        """Screen all candidates, and fit the best; from a better base, if these fits lead to one."""
+    def _sharpened(self, trial: Trial) -> Base:
+        """A trial's hypothesis as a base: fitted to the sensors' noise, and then to what even that leaves.
+
+        What the trial left was of a fit in the noise of a base that lacked the effect.
+        """
+        effects = trial.hypothesis.candidates
+        self._tolerance = np.ones(len(self._tolerance))
+        trial = min(trial, self.base(effects, trial.fit.u), key=lambda t: t.excess)
+        self._tolerance = left_by(trial)
+        return self.base(effects, trial.fit.u)
+
+    def stage(self, base: Base) -> Stage:
+        """Screen all candidates, and fit the best."""
         open_candidates = [c for c in self.candidates if c not in base.hypothesis.candidates]
         screened = []
         for done, candidate in enumerate(open_candidates):
@@ -148,22 +162,28 @@ class Search:
         everywhere = afresh if base.excess > LARGE else ()
         far = {candidate: (start, *afresh) for candidate, start in spoken_for.items()}
         trials = self.trials(base, [_Refit(one, far.get(one.candidate, everywhere)) for one in promising])
-        if polish and (better := self._polished(base, trials)) is not None:
-            return self.stage(better, polish=False)
         best = min(trials, key=lambda trial: trial.fit.loss + 0.5 * np.sum((trial.held_out / base.tolerance) ** 2))
         worth = worth_of(best)
         scores = [score_of(base, s.candidate, t, worth) for s, t in zip(promising, trials, strict=True)]
         return Stage(base, tuple(screened), tuple(sorted(scores, key=lambda score: -score.total)))
 
-    def _polished(self, base: Base, trials: Sequence[Trial]) -> Base | None:
-        """The base fitted from where candidates led its parameters; None where it comes out no better.
+    def _polished(self, stage: Stage) -> Stage:
+        """A stage from the base fitted from where candidates led its parameters, if it comes out better there.
 
         Or what a candidate's fit found, and the base's had missed, would count as the candidate's merit.
         """
+        base = stage.base
         misfit = Misfit(base.hypothesis, self.data.fitted).with_noise(base.noise)
-        start = misfit.best(np.array([trial.fit.u[: len(base.fit.u)] for trial in trials]))
-        found = self._fit(misfit, start, DIFFERENCES[1:])
-        return self.base(base.hypothesis.candidates, found.u) if found.loss < base.fit.loss - _BETTER else None
+        found = self._fit(misfit, self._led_to(stage), DIFFERENCES[1:])
+        if found.loss > base.fit.loss - _BETTER:
+            return stage
+        return self.stage(self.base(base.hypothesis.candidates, found.u))
+
+    def _led_to(self, stage: Stage) -> Array:
+        """The base's coordinates (d,), of those that its candidates' fits led to, that are best without a candidate."""
+        base = stage.base
+        misfit = Misfit(base.hypothesis, self.data.fitted).with_noise(base.noise)
+        return misfit.best(np.array([score.trial.fit.u[: len(base.fit.u)] for score in stage.scores]))
 
     def screen(self, base: Base, candidate: Candidate) -> Screened:
         """What a candidate would gain if its best probe acted linearly."""
@@ -196,19 +216,23 @@ class Search:
     def _large(self, base: Base, screened: Sequence[Screened]) -> list[Candidate]:
         """The candidates that come nearest to the data at some size, where the base is far from them.
 
-        The other parameters are at the priors' means, as the base may be bent, and few windows tell that much.
+        The other parameters are at the priors' means, as the base may be bent, and few windows tell that much. They
+        are looked for once: the same effects in another noise change little of it.
         """
         if base.excess < LARGE:
             return []
-        rows = np.argsort(-np.sum(base.fit.errors**2, axis=(1, 2)), kind="stable")[:_WINDOWS_OF_LARGE]
-        windows, noise = self.data.fitted.select(rows), base.noise.select(rows)
-        start, losses = _afresh(base), []
-        for done, one in enumerate(screened):
-            self._progress("try sizes of", done, len(screened))
-            misfit = Misfit(one.hypothesis, windows).with_noise(noise)
-            own = np.concatenate([start, one.hypothesis.neutral()[len(start) :]])
-            losses.append(misfit.losses(of_some_size(misfit, one.candidate, own)[None])[0])
-        return [screened[i].candidate for i in np.argsort(losses, kind="stable")[:LARGE_REFITTED]]
+        effects = base.hypothesis.candidates
+        if effects not in self._largest:
+            rows = np.argsort(-np.sum(base.fit.errors**2, axis=(1, 2)), kind="stable")[:_WINDOWS_OF_LARGE]
+            windows, noise = self.data.fitted.select(rows), base.noise.select(rows)
+            afresh, nearest = _afresh(base), []
+            for done, one in enumerate(screened):
+                self._progress("try sizes of", done, len(screened))
+                nearest.append(_of_some_size(one, windows, noise, afresh))
+            order = np.argsort([loss for loss, _ in nearest], kind="stable")[: _FINER * LARGE_REFITTED]
+            fine = [_of_some_size(screened[i], windows, noise, afresh, nearest[i][1])[0] for i in order]
+            self._largest[effects] = [screened[order[i]].candidate for i in np.argsort(fine, kind="stable")]
+        return self._largest[effects][:LARGE_REFITTED]
 
     def trials(self, base: Base, refits: Sequence[_Refit]) -> list[Trial]:
         """Candidates fitted, each together with all that the base has."""
@@ -301,6 +325,23 @@ def _fitted(refit: _Refit, base: Base, fitted: Windows, held_out: Windows, num_t
     found = min(fits, key=lambda f: f.loss)
     test = Misfit(hypothesis, held_out, num_threads).with_noise(base.held_out_noise)
     return {**vars(found), "held_out": base.tolerance * test.errors(found.u[None])[0]}
+
+
+def _of_some_size(
+    screened: Screened, windows: Windows, noise: Noise, base: Array, rough: Array | None = None
+) -> tuple[float, Array]:
+    """How far a candidate is from some windows at the size that comes nearest, or nearest around a rough one (d,).
+
+    That is -log p, and the coordinates; those of the base (k,) stay.
+    """
+    hypothesis, candidate = screened.hypothesis, screened.candidate
+    misfit = Misfit(hypothesis, windows).with_noise(noise)
+    start = np.concatenate([base, hypothesis.neutral()[len(base) :]])
+    if rough is None:
+        found = of_rough_size(misfit, candidate, start)
+    else:
+        found = of_fine_size(misfit, candidate, start, rough)
+    return float(misfit.losses(found[None])[0]), found
 
 
 def _afresh(base: Base) -> Array:

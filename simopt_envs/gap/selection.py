@@ -10,7 +10,16 @@ import numpy as np
 from simopt_envs.gap.fit import Fit
 from simopt_envs.gap.hypothesis import Candidate
 from simopt_envs.gap.plain import SPEAKS_FOR
-from simopt_envs.gap.thresholds import EVIDENCE, EVIDENCE_EACH, EXPLAINED, FAR, FURTHER, SIMPLER, SIMPLER_SHARE
+from simopt_envs.gap.thresholds import (
+    EVIDENCE,
+    EVIDENCE_EACH,
+    EXPLAINED,
+    FAR,
+    FURTHER,
+    SIMPLER,
+    SIMPLER_LEAVES,
+    SIMPLER_SHARE,
+)
 from simopt_envs.gap.trial import Base, Trial
 from simopt_envs.physics.parameters import Array
 
@@ -58,7 +67,8 @@ def chosen(null: Base, base: Base, scores: Sequence[Score]) -> Score | None:
 
     A law of slightly another form than the true one leaves an error that nothing in the library describes, but much of
     it bends a little. So a further effect must make the model right, to what noise is, or explain a share of what the
-    ones before it did. Where even the best leaves more than noise, a simpler one that takes nearly as much is as good.
+    ones before it did. Where even the best leaves more than noise, a simpler one that takes, and leaves, nearly as much
+    is as good.
     """
     earned = [score for score in scores if score.earned]
     if base is not null:
@@ -71,7 +81,8 @@ def chosen(null: Base, base: Base, scores: Sequence[Score]) -> Score | None:
     if not earned:
         return None
     best = earned[0]
-    enough = base.excess - SIMPLER_SHARE * (base.excess - best.trial.excess)
+    most = base.excess - SIMPLER_SHARE * (base.excess - best.trial.excess)
+    enough = min(most, SIMPLER_LEAVES * best.trial.excess)
     clearly = max(SIMPLER, FURTHER * best.held_out)
     as_good = [
         s
