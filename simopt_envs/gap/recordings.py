@@ -37,9 +37,9 @@ def split(recordings: Sequence[Recording]) -> tuple[list[Recording], list[Record
         )
         return [fitted], [replace(held_out, name=f"{held_out.name} (later part)")], (only,)
     ordered = sorted(recordings, key=_liveliness, reverse=True)
-    held_out = np.linspace(1, len(ordered) - 2, len(ordered) // 2).round().astype(int).tolist()
-    fitted = [i for i in range(len(ordered)) if i not in held_out]
-    return [ordered[i] for i in fitted], [ordered[i] for i in held_out], ()
+    within = np.linspace(1, len(ordered) - 2, len(ordered) // 2).round().astype(int).tolist()
+    ends = [i for i in range(len(ordered)) if i not in within]
+    return [ordered[i] for i in ends], [ordered[i] for i in within], ()
 
 
 def read_windows(model: mujoco.MjModel, recordings: Sequence[Recording], keyframe: str | None = None) -> Data:
