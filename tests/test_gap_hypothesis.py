@@ -95,3 +95,19 @@ def _at_rest(spec: mujoco.MjSpec, candidate: Candidate, value: float) -> list[Re
         columns |= {f"site/tip/{a}": data.site("tip").xpos[i] for i, a in enumerate("xyz")}
         recordings.append(Recording(time, {k: np.full(60, v) for k, v in columns.items()}, f"still_{number}"))
     return recordings
+
+
+def test_a_cogging_of_negative_amplitude_is_the_same_as_people_write_it(arm):
+    plain, data, motion = arm
+    candidate = Candidate(EFFECTS["cogging"], "joint:elbow")
+    hypothesis = Hypothesis(plain, [candidate], motion)
+    xi = hypothesis.space.nominal.copy()
+    xi[hypothesis.columns[candidate]] = -0.5, 7.0, -0.4
+    u = hypothesis.coordinates(xi)
+    usual = hypothesis.usual(u)
+    values = hypothesis.values(candidate, hypothesis.xi(usual[None])[0])
+    assert values == pytest.approx({"amplitude": 0.5, "periods": 7.0, "phase": np.pi - 0.4})
+    np.testing.assert_array_equal(usual[: hypothesis.num_plain], u[: hypothesis.num_plain])
+    np.testing.assert_array_equal(hypothesis.usual(usual), usual)
+    given, written = hypothesis.simulator(data.fitted)(hypothesis.xi(np.array([u, usual])))
+    np.testing.assert_allclose(given, written, atol=1e-9)

@@ -68,10 +68,22 @@ class Fit:
         orthonormal, triangle = np.linalg.qr(self.rows)
         return orthonormal, triangle
 
-    def covariance(self) -> Array:
-        """Of u, from the Gauss-Newton Hessian, for errors of variance 1."""
+    def variance(self, mean_square: float = 1.0) -> Array:
+        """Of u, (d,): of the Gauss-Newton Hessian or, where that is more, of how far windows pull it apart.
+
+        The latter (White 1980, clustered by window) holds where errors are not what their noise says: those that a
+        wrong law, or a start, leaves in a window go together.
+
+        Args:
+            mean_square: of whitened errors.
+        """
         rows = self.rows
-        return np.asarray(np.linalg.pinv(rows.T @ rows, hermitian=True), dtype=np.float64)
+        inverse = np.asarray(np.linalg.pinv(rows.T @ rows, hermitian=True), dtype=np.float64)
+        windows = len(self.errors)
+        jacobian, errors = self.jacobian.reshape(windows, -1, len(self.u)), self.errors.reshape(windows, -1)
+        pulls = np.einsum("wmd,wm->wd", jacobian, errors)
+        apart = pulls.T @ pulls * windows / max(windows - 1, 1) + np.diag(self.prior_std**-2.0)
+        return np.maximum(mean_square * np.diag(inverse), np.diag(inverse @ apart @ inverse))
 
 
 class Misfit:

@@ -120,6 +120,15 @@ class Hypothesis:
         prefix = candidate.full_name("")
         return {self.space.names[i].removeprefix(prefix): float(xi[i]) for i in self.columns[candidate]}
 
+    def usual(self, u: Array) -> Array:
+        """Coordinates (d,) that mean the same, with each effect's values as people write them."""
+        out, xi = u.copy(), self.xi(u[None])[0]
+        for candidate, columns in self.columns.items():
+            values = candidate.effect.usual(self.values(candidate, xi))
+            named = {candidate.full_name(name): value for name, value in values.items()}
+            out[columns] = self.coordinates(self.space.values(named))[columns]
+        return out
+
     def amounts(self, candidate: Candidate) -> list[int]:
         """The columns of a candidate that say how much of the effect there is, not what shape it has."""
         shape = {candidate.full_name(name) for name in candidate.effect.shape}

@@ -143,9 +143,10 @@ class Search:
         """
         effects = trial.hypothesis.candidates
         self._tolerance = np.ones(len(self._tolerance))
-        trial = min(trial, self.base(effects, trial.fit.u), key=lambda t: t.excess)
+        usual = trial.hypothesis.usual
+        trial = min(trial, self.base(effects, usual(trial.fit.u)), key=lambda t: t.excess)
         self._tolerance = left_by(trial)
-        return self.base(effects, trial.fit.u)
+        return self.base(effects, usual(trial.fit.u))
 
     def stage(self, base: Base) -> Stage:
         """Screen all candidates, and fit the best."""

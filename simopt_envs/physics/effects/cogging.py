@@ -7,7 +7,7 @@ import itertools
 import mujoco
 import numpy as np
 
-from simopt_envs.physics.effects.effect import Effect, Motion, object_name
+from simopt_envs.physics.effects.effect import Effect, Motion, Values, object_name
 from simopt_envs.physics.effects.joints import (
     add_passive_motor,
     dof,
@@ -62,3 +62,12 @@ class Cogging(Effect):
             {"amplitude": force, "periods": float(k) * base, "phase": phase}
             for k, phase in itertools.product(_PERIODS, _PHASES)
         )
+
+    def usual(self, values: Values) -> dict[str, float]:
+        """Of a positive amplitude, with a phase between -pi and pi."""
+        phase = values["phase"] + (np.pi if values["amplitude"] < 0 else 0.0)
+        return {
+            "amplitude": abs(values["amplitude"]),
+            "periods": values["periods"],
+            "phase": float(np.angle(np.exp(1j * phase))),
+        }

@@ -88,6 +88,10 @@ class Effect(ABC):
         """Whether fitted values are what the effect's name means, where other effects can look the same."""
         return True
 
+    def usual(self, values: Values) -> dict[str, float]:
+        """Of several sets of values that mean the same law, the one that people write."""
+        return dict(values)
+
 
 def object_name(place: str) -> str:
     """``"joint:elbow"`` -> ``"elbow"``."""
