@@ -18,8 +18,8 @@ from simopt_envs.gap.hypothesis import Candidate, Hypothesis
 from simopt_envs.gap.kept import kept_fits, key_of
 from simopt_envs.gap.large import of_fine_size, of_rough_size, of_some_size
 from simopt_envs.gap.plain import SPEAKS_FOR, Plain
-from simopt_envs.gap.selection import Score, chosen, left_by, score_of, worth_of
-from simopt_envs.gap.thresholds import COARSE, FAR, LARGE, LARGE_REFITTED, MOST_EFFECTS, REFITTED
+from simopt_envs.gap.selection import Score, chosen, score_of, tolerance_of, worth_of
+from simopt_envs.gap.thresholds import FAR, LARGE, LARGE_REFITTED, MOST_EFFECTS, REFITTED
 from simopt_envs.gap.trial import Base, Data, Screened, Trial
 from simopt_envs.measured.windows import Windows
 from simopt_envs.physics.effects import Motion
@@ -105,9 +105,8 @@ class Search:
     def run(self) -> Explanation:
         """Add effects while they earn it, then take away those that the others have made needless."""
         stage = self.stage(self.base())
-        left = left_by(min((score.trial for score in stage.scores), key=lambda trial: trial.excess))
-        if np.any(left > COARSE):  # only now it is known that nothing comes near the sensors' noise
-            self._tolerance = left
+        self._tolerance = tolerance_of(min((score.trial for score in stage.scores), key=lambda trial: trial.excess))
+        if np.any(self._tolerance > 1):  # only now it is known that nothing comes near the sensors' noise
             stage = self.stage(self.base(start=self._led_to(stage)))
         stages = [self._polished(stage)]
         null = base = stages[0].base
@@ -137,16 +136,16 @@ class Search:
         return Base(hypothesis, found, errors, noise, held_out_noise, self._tolerance)
 
     def _sharpened(self, trial: Trial) -> Base:
-        """A trial's hypothesis as a base: fitted to the sensors' noise, and then to what even that leaves.
+        """A trial's hypothesis as a base: fitted to the sensors' noise or, where that leaves far more, to what is left.
 
-        What the trial left was of a fit in the noise of a base that lacked the effect.
+        What the trial itself left was of a fit in the noise of a base that lacked the effect.
         """
-        effects = trial.hypothesis.candidates
+        effects, usual = trial.hypothesis.candidates, trial.hypothesis.usual
         self._tolerance = np.ones(len(self._tolerance))
-        usual = trial.hypothesis.usual
-        trial = min(trial, self.base(effects, usual(trial.fit.u)), key=lambda t: t.excess)
-        self._tolerance = left_by(trial)
-        return self.base(effects, usual(trial.fit.u))
+        base = self.base(effects, usual(trial.fit.u))
+        best = min(trial, base, key=lambda t: t.excess)
+        self._tolerance = tolerance_of(best)
+        return self.base(effects, usual(best.fit.u)) if np.any(self._tolerance > 1) else base
 
     def stage(self, base: Base) -> Stage:
         """Screen all candidates, and fit the best."""
@@ -159,9 +158,8 @@ class Search:
         spoken_for = self._spoken_for(base)
         wanted = [*spoken_for, *self._large(base, screened)]
         promising = screened[:REFITTED] + [s for s in screened[REFITTED:] if s.candidate in wanted]
-        afresh = (_afresh(base),)
-        everywhere = afresh if base.excess > LARGE else ()
-        far = {candidate: (start, *afresh) for candidate, start in spoken_for.items()}
+        everywhere = (_afresh(base),) if base.excess > LARGE else ()
+        far = {candidate: (start, *everywhere) for candidate, start in spoken_for.items()}
         trials = self.trials(base, [_Refit(one, far.get(one.candidate, everywhere)) for one in promising])
         best = min(trials, key=lambda trial: trial.fit.loss + 0.5 * np.sum((trial.held_out / base.tolerance) ** 2))
         worth = worth_of(best)

@@ -11,6 +11,7 @@ from simopt_envs.gap.fit import Fit
 from simopt_envs.gap.hypothesis import Candidate
 from simopt_envs.gap.plain import SPEAKS_FOR
 from simopt_envs.gap.thresholds import (
+    COARSE,
     EVIDENCE,
     EVIDENCE_EACH,
     EXPLAINED,
@@ -106,9 +107,13 @@ def worth_of(best: Trial) -> Array:
     return 1 / np.maximum(mean_square * np.where(mean_square > EXPLAINED, alike, 1.0), 1.0)
 
 
-def left_by(best: Trial) -> Array:
-    """The errors that a model leaves, in units of the sensors' noise, (c,), each counted by what it is worth."""
-    return 1 / np.sqrt(worth_of(best))
+def tolerance_of(best: Trial) -> Array:
+    """What errors are to be counted in, in units of the sensors' noise, (c,).
+
+    That is 1 or, where even the best model leaves far more in some channel, what it leaves, by what that is worth.
+    """
+    coarse = np.sqrt(np.mean(best.held_out**2, axis=(0, 1))) > COARSE
+    return 1 / np.sqrt(worth_of(best)) if coarse.any() else np.ones(len(coarse))
 
 
 def score_of(base: Base, candidate: Candidate, trial: Trial, worth: Array) -> Score:
