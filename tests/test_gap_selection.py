@@ -1,0 +1,71 @@
+"""Which recordings are held out, and which of several candidates is called missing."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from simopt_envs.gap.hypothesis import Candidate
+from simopt_envs.gap.recordings import split
+from simopt_envs.gap.selection import Score, chosen, tolerance_of
+from simopt_envs.measured import Recording
+from simopt_envs.physics.effects import EFFECTS
+
+
+def _recording(speed: float) -> Recording:
+    time = np.linspace(0.0, 2 * np.pi, 629)  # whole periods
+    return Recording(time, {"qpos/elbow": np.sin(speed * time)}, f"{speed:g}")
+
+
+@pytest.mark.parametrize("count", range(3, 10))
+def test_what_is_held_out_is_neither_the_fastest_nor_the_slowest(count):
+    recordings = [_recording(speed) for speed in np.random.default_rng(count).permutation(count) + 1.0]
+    fitted, held_out, warnings = split(recordings)
+    speeds = [sorted(float(r.name) for r in half) for half in (fitted, held_out)]
+    assert sorted(speeds[0] + speeds[1]) == [*np.arange(1.0, count + 1)]
+    assert len(held_out) == count // 2
+    assert min(speeds[0]) == 1.0
+    assert max(speeds[0]) == count
+    assert warnings == ()
+
+
+def test_of_two_recordings_the_faster_is_fitted():
+    (fitted,), (held_out,), _ = split([_recording(1.0), _recording(4.0)])
+    assert (fitted.name, held_out.name) == ("4", "1")
+
+
+def _score(parameters: int, excess: float, nats: float) -> Score:
+    trial: Any = SimpleNamespace(
+        fit=SimpleNamespace(u=np.zeros(parameters)),
+        excess=excess,
+        hypothesis=SimpleNamespace(is_itself=lambda candidate, u: True),
+    )
+    return Score(Candidate(EFFECTS["coulomb_friction"], "joint:elbow"), trial, nats, nats, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("base", "best", "simple", "simple_wins"),
+    [
+        (1.0, 0.5, 0.55, True),  # 90 % of what the best takes, and it leaves hardly more
+        (1.0, 0.5, 0.7, False),  # 60 % of what the best takes
+        (124.0, 2.75, 9.4, False),  # 95 %, but it leaves over three times as much
+        (124.0, 2.75, 4.0, True),
+        (124.0, 0.01, 0.015, False),  # the best is right to what noise is
+    ],
+)
+def test_a_simpler_law_is_as_good_where_it_takes_and_leaves_nearly_as_much(base, best, simple, simple_wins):
+    null: Any = SimpleNamespace(excess=base)
+    scores = [_score(5, best, 1000.0), _score(4, simple, 900.0)]
+    assert chosen(null, null, scores) is scores[simple_wins]
+
+
+def test_errors_count_in_what_is_left_only_where_that_is_far_more_than_noise():
+    rng = np.random.default_rng(0)
+    noise = rng.normal(size=(8, 26, 2))
+    right: Any = SimpleNamespace(held_out=noise)
+    np.testing.assert_array_equal(tolerance_of(right), 1.0)
+    astray: Any = SimpleNamespace(held_out=noise * np.array([1.0, 20.0]))
+    assert tolerance_of(astray) == pytest.approx([1.0, 20.0], rel=0.1)
