@@ -27,7 +27,7 @@ ENV_ID = "SimOpt/Drawer-v0"
 HIDDEN: tuple[Mapping[str, Any], ...] = (
     {"effect": "payload", "where": "body:link7", "parameters": {"mass": 2.5}},
     {"effect": "joint_spring", "where": "joint:joint2", "parameters": {"stiffness": 100.0, "reference": -0.6}},
-    {"effect": "quadratic_drag", "where": "joint:joint2", "parameters": {"drag": 300.0}},
+    {"effect": "coulomb_friction", "where": "joint:joint2", "parameters": {"frictionloss": 40.0}},
 )
 """What the hidden arm may have: a load at the hand, a cable that pulls the shoulder, a shoulder that runs in oil."""
 
