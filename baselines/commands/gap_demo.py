@@ -29,7 +29,7 @@ HIDDEN: tuple[Mapping[str, Any], ...] = (
     {"effect": "joint_spring", "where": "joint:joint2", "parameters": {"stiffness": 100.0, "reference": -0.6}},
     {"effect": "coulomb_friction", "where": "joint:joint2", "parameters": {"frictionloss": 40.0}},
 )
-"""What the hidden arm may have: a load at the hand, a cable that pulls the shoulder, a shoulder that runs in oil."""
+"""What the hidden arm may have: a load at the hand, a cable that pulls the shoulder, a shoulder that binds."""
 
 _NOISE = 0.002  # rad, m
 _ROLLOUTS = 6  # measured per iteration
