@@ -33,7 +33,7 @@ _STEPS = np.array([1.0, 0.3, 0.1, 0.03])  # shares of the screen's step that a f
 _WORTH_A_START = 0.2  # share of the best probe's gain at which a fit may start from another one
 _FURTHEST = 20.0  # probes that the screen's step may be long
 _WINDOWS_OF_LARGE = 4  # that candidates of several sizes are tried on
-_FINER = 4  # times as many candidates as are fitted at such a size are tried at finer ones
+_TRIED_FINELY = 4  # times as many candidates as are fitted at such a size are tried at finer ones
 _BETTER = 2.0  # nats by which a base must become better for its candidates to be fitted anew
 
 
@@ -174,9 +174,8 @@ class Search:
         base = stage.base
         misfit = Misfit(base.hypothesis, self.data.fitted).with_noise(base.noise)
         found = self._fit(misfit, self._led_to(stage), DIFFERENCES[1:])
-        if found.loss > base.fit.loss - _BETTER:
-            return stage
-        return self.stage(self.base(base.hypothesis.candidates, found.u))
+        better = found.loss < base.fit.loss - _BETTER
+        return self.stage(self.base(base.hypothesis.candidates, found.u)) if better else stage
 
     def _led_to(self, stage: Stage) -> Array:
         """The base's coordinates (d,), of those that its candidates' fits led to, that are best without a candidate."""
@@ -228,7 +227,7 @@ class Search:
             for done, one in enumerate(screened):
                 self._progress("try sizes of", done, len(screened))
                 nearest.append(_of_some_size(one, windows, noise, afresh))
-            order = np.argsort([loss for loss, _ in nearest], kind="stable")[: _FINER * LARGE_REFITTED]
+            order = np.argsort([loss for loss, _ in nearest], kind="stable")[: _TRIED_FINELY * LARGE_REFITTED]
             fine = [_of_some_size(screened[i], windows, noise, afresh, nearest[i][1])[0] for i in order]
             self._largest[effects] = [screened[order[i]].candidate for i in np.argsort(fine, kind="stable")]
         return self._largest[effects][:LARGE_REFITTED]
