@@ -186,7 +186,7 @@ def candidates_figure(
     axis.invert_yaxis()
     axis.grid(visible=False, axis="y")
     axis.set_xlabel("gain [nats]")
-    axis.legend(loc="lower right")
+    figure.legend(loc="outside upper right", ncols=3)
     return figure
 
 
