@@ -15,15 +15,16 @@ from simopt_envs.distributions.gaussian import Gaussian
 from simopt_envs.engine import Engine
 from simopt_envs.gap.describe import Residual, describe
 from simopt_envs.gap.error import held_out_errors
+from simopt_envs.gap.fit import Misfit
 from simopt_envs.gap.hypothesis import Candidate
 from simopt_envs.gap.localise import localise
 from simopt_envs.gap.motion import motion_of
 from simopt_envs.gap.plain import Plain, plain_parameters
-from simopt_envs.gap.recordings import read_windows
+from simopt_envs.gap.recordings import read_windows, whole_recordings
 from simopt_envs.gap.result import Gap, judge, named_effects, repair
 from simopt_envs.gap.search import Explanation, Progress, Search
 from simopt_envs.gap.separate import separate
-from simopt_envs.gap.trial import Data
+from simopt_envs.gap.trial import Base, Data
 from simopt_envs.measured.mapping import LogMapping
 from simopt_envs.measured.readers import load_recordings
 from simopt_envs.measured.recording import Recording
@@ -77,8 +78,9 @@ def find_gap(
     data = read_windows(start.model, read, keyframe)
     motion = motion_of(start.model, read, keyframe)
     seen = tuple(c for effect in effects for c in _places(effect, start.model) if _shows(c, start.model, data.fitted))
+    whole = whole_recordings(start.model, data, keyframe)
     with _silent_warnings():
-        explanation = Search(start, data, motion, seen, progress, engine, directory).run()
+        explanation = Search(start, data, motion, seen, progress, engine, directory, whole).run()
         return _gap(given, explanation, data, keyframe, began)
 
 
@@ -102,15 +104,21 @@ def _gap(given: mujoco.MjSpec, explanation: Explanation, data: Data, keyframe: s
     fitted = [base.hypothesis.xi(base.fit.u[None])[0] for base in (null, final)]
     models = [(null.hypothesis, as_given), (null.hypothesis, fitted[0]), (final.hypothesis, fitted[1])]
     errors = held_out_errors(data.held_out, models, null.sensor_noise, np.random.default_rng(_SEED))
-    explained = Explanation(null, final, explanation.stages)
+    explained = replace(explanation, final=final)
     spec, diff = repair(explained, given, fitted[1])
-    rows = localise(data.held_out, null.whitened[1], null.hypothesis.plain.model)
-    noises = (replace(noise, scale=final.sensor_noise) for noise in (final.noise, final.held_out_noise))
-    residuals = list(map(Residual, (data.fitted, data.held_out), final.whitened, noises))
+    rows = localise(data.held_out, _left_by(null, data.held_out).errors, null.hypothesis.plain.model)
+    residuals = [_left_by(final, windows) for windows in (data.fitted, data.held_out)]
     left = describe(final.hypothesis, final.fit.u, residuals)
-    named = separate(named_effects(explained), explained, data, keyframe)
+    named = separate(named_effects(explained), explained, keyframe)
     seconds = time.perf_counter() - began
     return Gap(verdict, named, errors, rows, left, explained, data, spec, diff, seconds)
+
+
+def _left_by(base: Base, windows: Windows) -> Residual:
+    """What a fitted hypothesis leaves of some windows, in units of the noise of sensors and starts."""
+    u, misfit = base.fit.u, Misfit(base.hypothesis, windows)
+    noise = misfit.noise_at(u, base.sensor_noise)
+    return Residual(windows, misfit.with_noise(noise).errors(u[None])[0], noise)
 
 
 def _spec(model: str | Path | mujoco.MjSpec) -> mujoco.MjSpec:

@@ -15,7 +15,7 @@ from mujoco import minimize
 
 from simopt_envs.adaptation.fitting import Noise
 from simopt_envs.gap.hypothesis import Hypothesis
-from simopt_envs.measured.replay import start_sensitivity
+from simopt_envs.measured.replay import start_curvature, start_sensitivity
 from simopt_envs.measured.windows import Windows
 from simopt_envs.physics.parameters import Array
 
@@ -68,22 +68,28 @@ class Fit:
         orthonormal, triangle = np.linalg.qr(self.rows)
         return orthonormal, triangle
 
-    def variance(self, mean_square: float = 1.0) -> Array:
-        """Of u, (d,): of the Gauss-Newton Hessian or, where that is more, of how far windows pull it apart.
+    def variance(self, mean_square: float = 1.0, parts: int = 1) -> Array:
+        """Of u, (d,): of the Gauss-Newton Hessian or, where that is more, of how far stretches of data pull it apart.
 
-        The latter (White 1980, clustered by window) holds where errors are not what their noise says: those that a
-        wrong law, or a start, leaves in a window go together.
+        The latter (White 1980, clustered by stretch) holds where errors are not what their noise says: those that a
+        wrong law, or a start, leaves in a stretch go together.
 
         Args:
             mean_square: of whitened errors.
+            parts: stretches in a window.
         """
         rows = self.rows
         inverse = np.asarray(np.linalg.pinv(rows.T @ rows, hermitian=True), dtype=np.float64)
-        windows = len(self.errors)
-        jacobian, errors = self.jacobian.reshape(windows, -1, len(self.u)), self.errors.reshape(windows, -1)
-        pulls = np.einsum("wmd,wm->wd", jacobian, errors)
-        apart = pulls.T @ pulls * windows / max(windows - 1, 1) + np.diag(self.prior_std**-2.0)
+        jacobian = self.jacobian.reshape(*self.errors.shape, len(self.u))
+        pulls = by_part(np.einsum("wscd,wsc->wsd", jacobian, self.errors), parts)
+        apart = pulls.T @ pulls * len(pulls) / max(len(pulls) - 1, 1) + np.diag(self.prior_std**-2.0)
         return np.maximum(mean_square * np.diag(inverse), np.diag(inverse @ apart @ inverse))
+
+
+def by_part(values: Array, parts: int) -> Array:
+    """Sums over the samples of each of the parts of equal length of each window, (w, S, ...) -> (w parts, ...)."""
+    first = np.arange(parts) * values.shape[1] // parts
+    return np.add.reduceat(values, first, axis=1).reshape(-1, *values.shape[2:])
 
 
 class Misfit:
@@ -144,6 +150,15 @@ class Misfit:
         """The noise of sensors of a scale (c,) with what uncertain starts leave at u (d,)."""
         starts = start_sensitivity(self.hypothesis.model, self._simulate, self.hypothesis.xi(u[None]))
         return Noise.of(scale, np.where(self._counted, np.nan_to_num(starts), 0.0))
+
+    def bent_by_starts(self, u: Array) -> float:
+        """What the noise does not tell of uncertain starts at u (d,), as they act on windows linearly there alone.
+
+        That is a mean square, in units of the noise of sensors.
+        """
+        curvature = start_curvature(self.hypothesis.model, self._simulate, self.hypothesis.xi(u[None]))
+        bent = np.where(self._counted, np.nan_to_num(curvature, nan=np.inf), 0.0) / self.noise.scale
+        return float(np.mean(np.sum(bent**2, axis=0)))
 
     def noise_floor(self, u: Array) -> Array:
         """Standard deviation of the part of the errors at u (d,) that one sample does not share with the next, (c,).

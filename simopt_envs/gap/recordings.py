@@ -8,15 +8,16 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from simopt_envs.gap.thresholds import WINDOW
+from simopt_envs.gap.thresholds import LONG_WINDOW, WINDOW
 from simopt_envs.gap.trial import Data
 from simopt_envs.measured.audit import audited
 from simopt_envs.measured.recording import Finding, Recording
-from simopt_envs.measured.windows import cut_windows
+from simopt_envs.measured.windows import Windows, cut_windows
 from simopt_envs.physics.effects.actuator_delay import LONGEST
 
 _GUARD = 0.5  # seconds between what is fitted of a single recording and what is held out
 _FITTED = 0.6  # share of a single recording that is fitted
+_LEAST_LEFT = 0.75  # of what short windows hold, that long ones must hold
 
 
 def split(recordings: Sequence[Recording]) -> tuple[list[Recording], list[Recording], tuple[Finding, ...]]:
@@ -67,6 +68,30 @@ def read_windows(model: mujoco.MjModel, recordings: Sequence[Recording], keyfram
         tuple(held_out),
         warnings,
     )
+
+
+def whole_recordings(model: mujoco.MjModel, data: Data, keyframe: str | None = None) -> Data | None:
+    """The same recordings as a whole or, where they are longer than ``LONG_WINDOW``, in equal parts.
+
+    None where that is no longer than they are cut already, or where gaps leave too little of them.
+    """
+    period = float(data.fitted.offsets[1])
+    shortest = min(r.duration for r in (*data.fitted_recordings, *data.held_out_recordings))
+    samples = int(shortest / period + 1e-6)
+    seconds = samples // int(np.ceil(samples * period / LONG_WINDOW)) * period
+
+    def longer(windows: Windows, recordings: Sequence[Recording]) -> Windows | None:
+        try:
+            cut = cut_windows(model, recordings, seconds, keyframe=keyframe, history=2 * LONGEST)
+        except ValueError:
+            return None
+        return cut if len(cut) * seconds > _LEAST_LEFT * len(windows) * data.seconds else None
+
+    fitted = longer(data.fitted, data.fitted_recordings)
+    held_out = longer(data.held_out, data.held_out_recordings)
+    if seconds < 2 * data.seconds or fitted is None or held_out is None:
+        return None
+    return replace(data, fitted=fitted, held_out=held_out)
 
 
 def _liveliness(recording: Recording) -> float:

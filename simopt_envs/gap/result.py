@@ -210,7 +210,7 @@ def named_effects(explanation: Explanation) -> tuple[Named, ...]:
     final = explanation.final
     hypothesis, u = final.hypothesis, final.fit.u
     mean_square = float(np.mean((final.held_out / final.tolerance) ** 2))
-    spread = np.sqrt(final.fit.variance(max(1.0, mean_square)))
+    spread = np.sqrt(final.fit.variance(max(1.0, mean_square), explanation.data.parts))
     ends = u + _NORMAL_95 * np.array([-spread, spread])
     xi, (low, high) = hypothesis.xi(u[None])[0], hypothesis.xi(ends)
     scores = {score.candidate: score for stage in explanation.stages for score in stage.scores}

@@ -19,7 +19,7 @@ from simopt_envs.gap.kept import kept_fits, key_of
 from simopt_envs.gap.large import of_fine_size, of_rough_size, of_some_size
 from simopt_envs.gap.plain import SPEAKS_FOR, Plain
 from simopt_envs.gap.selection import Score, chosen, score_of, tolerance_of, worth_of
-from simopt_envs.gap.thresholds import FAR, LARGE, LARGE_REFITTED, MOST_EFFECTS, REFITTED
+from simopt_envs.gap.thresholds import EXPLAINED, FAR, LARGE, LARGE_REFITTED, MOST_EFFECTS, REFITTED
 from simopt_envs.gap.trial import Base, Data, Screened, Trial
 from simopt_envs.measured.windows import Windows
 from simopt_envs.physics.effects import Motion
@@ -32,7 +32,7 @@ _ITERATIONS = 10
 _STEPS = np.array([1.0, 0.3, 0.1, 0.03])  # shares of the screen's step that a fit may start from
 _WORTH_A_START = 0.2  # share of the best probe's gain at which a fit may start from another one
 _FURTHEST = 20.0  # probes that the screen's step may be long
-_WINDOWS_OF_LARGE = 4  # that candidates of several sizes are tried on
+_SECONDS_OF_LARGE = 2.0  # of the worst windows, that candidates of several sizes are tried on
 _TRIED_FINELY = 4  # times as many candidates as are fitted at such a size are tried at finer ones
 _BETTER = 2.0  # nats by which a base must become better for its candidates to be fitted anew
 
@@ -60,11 +60,13 @@ class Explanation:
         null: the model as given, its plain parameters refitted.
         final: with all effects that are missing; the null where there are none.
         stages: one for each effect that was added, and the one that added none.
+        data: the windows that were fitted.
     """
 
     null: Base
     final: Base
     stages: tuple[Stage, ...]
+    data: Data
 
     @property
     def effects(self) -> tuple[Candidate, ...]:
@@ -83,6 +85,8 @@ class Search:
         progress: is told of it.
         engine: fits the candidates; this process by default.
         directory: keeps finished fits, from which a search of the same goes on; None for none.
+        whole: the recordings in longer windows, which are fitted instead where the model predicts as much; None for
+            never.
     """
 
     def __init__(
@@ -94,9 +98,10 @@ class Search:
         progress: Progress = lambda *_: None,
         engine: Engine | None = None,
         directory: str | Path | None = None,
+        whole: Data | None = None,
     ):
         self.plain, self.data, self.motion, self.candidates = plain, data, motion, tuple(candidates)
-        self._progress, self._engine = progress, engine or LocalEngine()
+        self._whole, self._progress, self._engine = whole, progress, engine or LocalEngine()
         self._kept = kept_fits(directory, plain, motion, data.fitted, data.held_out)
         self._floor: Array | None = None
         self._tolerance = np.ones(len(data.fitted.channels))
@@ -104,7 +109,11 @@ class Search:
 
     def run(self) -> Explanation:
         """Add effects while they earn it, then take away those that the others have made needless."""
-        stage = self.stage(self.base())
+        base = self.base()
+        if self._whole is not None and self._predicts(base, self._whole):
+            self.data = self._whole
+            base = self.base(start=base.fit.u)
+        stage = self.stage(base)
         self._tolerance = tolerance_of(min((score.trial for score in stage.scores), key=lambda trial: trial.excess))
         if np.any(self._tolerance > 1):  # only now it is known that nothing comes near the sensors' noise
             stage = self.stage(self.base(start=self._led_to(stage)))
@@ -116,7 +125,19 @@ class Search:
                 break
             stages.append(self._polished(self.stage(base)))
             base = stages[-1].base
-        return Explanation(null, self._eliminated(base), tuple(stages))
+        return Explanation(null, self._eliminated(base), tuple(stages), self.data)
+
+    @staticmethod
+    def _predicts(base: Base, longer: Data) -> bool:
+        """Whether a base is near enough to the data to be held against longer windows of them.
+
+        They tell more, as what a model lacks adds up and as fewer starts are uncertain. But what an uncertain start
+        does must be linear, as it is not where contacts are made or motion is chaotic; and a model that is far off
+        gets lost on the way.
+        """
+        misfit = Misfit(base.hypothesis, longer.fitted)
+        noise = Noise.of(base.sensor_noise, np.zeros((1, *longer.fitted.measured.shape)))
+        return base.excess < LARGE and misfit.with_noise(noise).bent_by_starts(base.fit.u) < EXPLAINED - 1
 
     def base(self, effects: Sequence[Candidate] = (), start: Array | None = None) -> Base:
         """The hypothesis of some effects, fitted with all its differences."""
@@ -221,7 +242,8 @@ class Search:
             return []
         effects = base.hypothesis.candidates
         if effects not in self._largest:
-            rows = np.argsort(-np.sum(base.fit.errors**2, axis=(1, 2)), kind="stable")[:_WINDOWS_OF_LARGE]
+            count = max(1, round(_SECONDS_OF_LARGE / self.data.seconds))
+            rows = np.argsort(-np.sum(base.fit.errors**2, axis=(1, 2)), kind="stable")[:count]
             windows, noise = self.data.fitted.select(rows), base.noise.select(rows)
             afresh, nearest = _afresh(base), []
             for done, one in enumerate(screened):

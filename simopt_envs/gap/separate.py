@@ -33,9 +33,7 @@ _NOISE_ALONE = 6.0  # standard deviations of a sensor's noise that a column may 
 _SEED = 0  # of the sensors' noise in what is simulated
 
 
-def separate(
-    named: Sequence[Named], explanation: Explanation, data: Data, keyframe: str | None = None
-) -> tuple[Named, ...]:
+def separate(named: Sequence[Named], explanation: Explanation, keyframe: str | None = None) -> tuple[Named, ...]:
     """The effects named, each partner with the motion that tells the two apart best.
 
     Partners stay without one where nothing can be commanded: the model has no actuators, their commands never moved,
@@ -44,19 +42,18 @@ def separate(
     Args:
         named: the effects of the explanation.
         explanation: of the data.
-        data: the recordings.
         keyframe: where joints without a column start.
     """
-    final = explanation.final
+    final, data = explanation.final, explanation.data
     motions = simulated_motions(final, data) if any(effect.partners for effect in named) else ()
     if not motions:
         return tuple(named)
-    length, history = float(data.fitted.offsets[-1]), 2 * LONGEST
+    length, history = min(data.seconds, *(motion.duration for motion in motions)), 2 * LONGEST
     windows = cut_windows(final.hypothesis.plain.model, motions, length, keyframe=keyframe, history=history)
     here, there = _Experiment(data.fitted, final.noise, final.hypothesis, final.fit), _Experiment.of(final, windows)
 
     def separation(effect: Candidate, partner: Candidate) -> Separation:
-        size = _fitted_size(explanation, data, effect, partner)
+        size = _fitted_size(explanation, effect, partner)
         recorded, rivals = (experiment.rivals(effect, partner, size) for experiment in (here, there))
         told = [rivals.told_apart(there.windows_of(motion)) for motion in motions]
         best = int(np.argmax([nats for _, nats in told]))
@@ -114,14 +111,14 @@ def _is_near(simulated: Array, data: Data, noise: Array) -> NDArray[np.bool_]:
     return np.asarray(inside & slow)
 
 
-def _fitted_size(explanation: Explanation, data: Data, effect: Candidate, partner: Candidate) -> Array:
+def _fitted_size(explanation: Explanation, effect: Candidate, partner: Candidate) -> Array:
     """The partner's parameters where it explains the data best in the effect's place, as far as it was fitted, (k,)."""
     stage = stage_of(explanation, effect)
     screened = next(s for s in stage.screened if s.candidate == partner)
     columns = screened.hypothesis.columns[partner]
     fitted = next((score.trial.fit.u for score in stage.scores if score.candidate == partner), None)
     if fitted is None:
-        fitted = Misfit(screened.hypothesis, data.fitted).with_noise(stage.base.noise).best(screened.starts)
+        fitted = Misfit(screened.hypothesis, explanation.data.fitted).with_noise(stage.base.noise).best(screened.starts)
     return fitted[columns]
 
 

@@ -58,3 +58,6 @@ CONFOUNDED = 0.9
 
 WINDOW = 0.5
 """Seconds of a window."""
+
+LONG_WINDOW = 4.0
+"""Seconds of a window at most, where the model is near enough to the data for whole recordings to be predicted."""

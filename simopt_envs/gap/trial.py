@@ -9,6 +9,7 @@ import numpy as np
 from simopt_envs.adaptation.fitting import Noise
 from simopt_envs.gap.fit import Fit
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
+from simopt_envs.gap.thresholds import WINDOW
 from simopt_envs.measured.recording import Finding, Recording
 from simopt_envs.measured.windows import Windows
 from simopt_envs.physics.parameters import Array
@@ -29,6 +30,16 @@ class Data:
     fitted_recordings: tuple[Recording, ...]
     held_out_recordings: tuple[Recording, ...]
     warnings: tuple[Finding, ...] = ()
+
+    @property
+    def seconds(self) -> float:
+        """Length of a window."""
+        return float(self.fitted.offsets[-1])
+
+    @property
+    def parts(self) -> int:
+        """How many times as long as the shortest a window is."""
+        return max(1, round(self.seconds / WINDOW))
 
 
 @dataclass(frozen=True)
@@ -69,11 +80,6 @@ class Base(Trial):
     def sensor_noise(self) -> Array:
         """Standard deviation of each channel's noise, (c,)."""
         return self.noise.scale / self.tolerance
-
-    @property
-    def whitened(self) -> tuple[Array, Array]:
-        """Errors fitted and held out, in units of the sensors' noise, (w, S, c)."""
-        return self.tolerance * self.fit.errors, self.held_out
 
 
 @dataclass(frozen=True)

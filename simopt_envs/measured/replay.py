@@ -161,6 +161,15 @@ def start_sensitivity(
     return np.array(perturbed).reshape(2 * model.nv, *nominal.shape) - nominal
 
 
+def start_curvature(model: mujoco.MjModel, simulator: Simulator, xi: Array | None = None) -> Array:
+    """What :func:`start_sensitivity`, which is linear, leaves out: half of the second difference, (2 nv, w, S, c)."""
+    nominal, starts = simulator(xi)[0], simulator.windows.starts
+    back = replace(starts, qpos_error=-starts.qpos_error, qvel_error=-starts.qvel_error)
+    pairs = zip(_perturbed(model, starts), _perturbed(model, back), strict=True)
+    both = [(simulator(xi, above)[0] + simulator(xi, below)[0]) / 2 for above, below in pairs]
+    return np.array(both).reshape(2 * model.nv, *nominal.shape) - nominal
+
+
 def _perturbed(model: mujoco.MjModel, starts: States) -> Iterator[States]:
     """The starts with one degree of freedom after the other moved by its standard error."""
     for dof in range(model.nv):
