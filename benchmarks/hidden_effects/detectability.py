@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,16 +23,20 @@ import numpy as np
 from benchmarks.hidden_effects.catalogue import EFFECTS, Effect
 from benchmarks.hidden_effects.outside import OUTSIDE
 from benchmarks.hidden_effects.plants import RECORDINGS, Array, Motion, Plant, nominal_model, plants
-from benchmarks.hidden_effects.truth import HALF_STEP_LEAD, MAX_LATENCY, Diverged, Law, Run, World, plain_parameters
+from benchmarks.hidden_effects.truth import HALF_STEP_LEAD, MAX_LATENCY, Diverged, Law, World, plain_parameters
 
 FILE = Path(__file__).with_name("detectable.json")
 SIGMAS = 5.0
-MOVES = 6
+MOVES = 10
 """Most moves of the plain parameters."""
+NEAR = 1.2
+"""How far from 5 sigmas a magnitude may be for what is left to be extrapolated."""
 EQUIVALENT = 0.99
 """Effects whose projected directions correlate by this much cannot be told apart."""
 SIMILAR = 0.9
 """The table lists others from here up."""
+UNSETTLED = 5
+"""Samples at the beginning of a stretch that do not count: what a delay shows there happened before."""
 FREE = 1e6
 """Standard deviations of the sensors' noise to which a start is known beforehand: as good as not at all. (A start that
 is known lets a shifted reading show where it shifts the start as well.)"""
@@ -72,14 +76,15 @@ class Observability:
 
     def __init__(self, plant: Plant, seed: int = 0):
         self.plant = plant
-        self._plain = {"latency": (HALF_STEP_LEAD + MAX_LATENCY) / 2}
+        self._plain = {"latency": MAX_LATENCY}
         self._stretches = self._cut(np.random.default_rng(seed))
         self._base = self._columns(())
         starts = self._start_sensitivity()
         self._starts = starts
         self._deviations = plain_parameters(plant)
-        latest = (MAX_LATENCY - HALF_STEP_LEAD) / 2 / self._deviations["latency"]
-        self._furthest = np.array([latest if name == "latency" else 3.0 for name in self._deviations])
+        # All of its range is there to undo a delay: in a system whose latency is the shortest, any longer one may do.
+        longest = (MAX_LATENCY - HALF_STEP_LEAD) / self._deviations["latency"]
+        self._furthest = np.array([longest if name == "latency" else 3.0 for name in self._deviations])
         self._slopes = np.stack([self._slope(unit) for unit in np.eye(len(self._deviations))], axis=1)
 
     def direction(self, law: Law) -> Array:
@@ -104,7 +109,7 @@ class Observability:
             gained = np.linalg.norm(best) - np.hypot(np.linalg.norm(change), np.linalg.norm(x))
             if gained > 0:
                 best = np.r_[change, x]
-            if gained < 0.02 * np.linalg.norm(best):
+            if gained < 0.005 * np.linalg.norm(best):
                 break
         return best
 
@@ -128,13 +133,14 @@ class Observability:
 
     def _columns(self, laws: Sequence[Law], plain: dict[str, float] | None = None) -> list[Array]:
         world = World(self.plant, laws, self._plain if plain is None else plain)
-        return [self._run(world, stretch).columns for stretch in self._stretches]
+        return [self._shown(world, stretch) for stretch in self._stretches]
 
     @staticmethod
-    def _run(world: World, stretch: Stretch, shift: tuple[Array, Array] | None = None) -> Run:
-        return world.run(
+    def _shown(world: World, stretch: Stretch, shift: tuple[Array, Array] | None = None) -> Array:
+        run = world.run(
             stretch.motion, commands=stretch.commands, first=stretch.first, start=stretch.start, shift=shift
         )
+        return run.columns[0 if stretch.start is None else UNSETTLED :]
 
     def _changed(self, laws: Sequence[Law], moved: Array) -> Array:
         """Whitened change of all columns under laws and with plain parameters moved by so many deviations, (n,).
@@ -165,8 +171,8 @@ class Observability:
         changes = []
         for i in (*unsure, *(nv + dof for dof in unsure)):
             shift = np.eye(2 * nv)[i] * deviation * step
-            runs = [self._run(world, s, (shift[:nv], shift[nv:])) for s in self._stretches]
-            changes.append([self._scaled(run.columns, b) / step for run, b in zip(runs, self._base, strict=True)])
+            shown = [self._shown(world, s, (shift[:nv], shift[nv:])) for s in self._stretches]
+            changes.append([self._scaled(columns, b) / step for columns, b in zip(shown, self._base, strict=True)])
         return [np.stack(parts, axis=1) for parts in zip(*changes, strict=True)]
 
     def _scaled(self, columns: Array, base: Array) -> Array:
@@ -185,11 +191,13 @@ class Found:
         magnitude: that was tried.
         sigmas: that it makes.
         direction: of the change.
+        least: the magnitude that makes 5, by this one and others tried.
     """
 
     magnitude: float
     sigmas: float
     direction: Array
+    least: float = np.nan
 
     @property
     def off(self) -> float:
@@ -229,11 +237,11 @@ def least_detectable(
             continue
         tried.append(Found(magnitude, float(np.linalg.norm(direction)), direction))
         following = min(_next_magnitude(tried), limit)
-        if abs(tried[-1].off) < np.log(2.5) or abs(following / magnitude - 1) < 0.01:
+        if abs(tried[-1].off) < np.log(NEAR) or abs(following / magnitude - 1) < 0.01:
             break
         magnitude = following
     best = min(tried, key=lambda f: abs(f.off), default=None)
-    return best if best is not None and best.sigmas > 0.1 else None
+    return replace(best, least=_next_magnitude(tried)) if best is not None and best.sigmas > 0.1 else None
 
 
 def _next_magnitude(tried: Sequence[Found]) -> float:
@@ -280,8 +288,7 @@ def analyse(plant: Plant, before: dict[str, dict[str, Any]]) -> dict[str, dict[s
                 continue
             alike.setdefault(other, round(float(correlation[i, j]), 4))
         result[name] = {
-            # What is left to go to 5 sigmas is extrapolated.
-            "least": answer.magnitude * SIGMAS / answer.sigmas,
+            "least": answer.least,
             "tried": answer.magnitude,
             "sigmas": round(answer.sigmas, 3),
             "alike": alike,

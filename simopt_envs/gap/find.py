@@ -65,8 +65,8 @@ def find_gap(
         FileNotFoundError: for a file that does not exist.
         FailedTasksError: naming the candidate, where a fit fails.
         ImportError: where MuJoCo is older than 4.0.
-        ValueError: for a model that does not compile, recordings that do not fit it, audits that found errors, or a
-            directory that keeps fits of something else.
+        ValueError: for a model that does not compile, recordings that do not fit it, audits that found errors,
+            effects none of which can act in the model, or a directory that keeps fits of something else.
     """
     require_mujoco()
     began = time.perf_counter()

@@ -19,7 +19,7 @@ from simopt_envs.gap.kept import kept_fits, key_of
 from simopt_envs.gap.large import of_fine_size, of_rough_size, of_some_size
 from simopt_envs.gap.plain import SPEAKS_FOR, Plain
 from simopt_envs.gap.selection import Score, chosen, score_of, tolerance_of, worth_of
-from simopt_envs.gap.thresholds import EXPLAINED, FAR, LARGE, LARGE_REFITTED, MOST_EFFECTS, REFITTED
+from simopt_envs.gap.thresholds import BENT, FAR, LARGE, LARGE_REFITTED, MOST_EFFECTS, REFITTED
 from simopt_envs.gap.trial import Base, Data, Screened, Trial
 from simopt_envs.measured.windows import Windows
 from simopt_envs.physics.effects import Motion
@@ -73,6 +73,11 @@ class Explanation:
         """What is missing."""
         return self.final.hypothesis.candidates
 
+    @property
+    def scores(self) -> dict[Candidate, Score]:
+        """What candidates earned in the last stage they were fitted in: effects, in that which added them."""
+        return {score.candidate: score for stage in self.stages for score in stage.scores}
+
 
 class Search:
     """A search on one set of data.
@@ -87,6 +92,9 @@ class Search:
         directory: keeps finished fits, from which a search of the same goes on; None for none.
         whole: the recordings in longer windows, which are fitted instead where the model predicts as much; None for
             never.
+
+    Raises:
+        ValueError: without candidates.
     """
 
     def __init__(
@@ -100,6 +108,10 @@ class Search:
         directory: str | Path | None = None,
         whole: Data | None = None,
     ):
+        if not candidates:
+            raise ValueError(
+                "there is nothing to search: none of the effects can act in this model and show in its data"
+            )
         self.plain, self.data, self.motion, self.candidates = plain, data, motion, tuple(candidates)
         self._whole, self._progress, self._engine = whole, progress, engine or LocalEngine()
         self._kept = kept_fits(directory, plain, motion, data.fitted, data.held_out)
@@ -121,7 +133,7 @@ class Search:
         null = base = stages[0].base
         while (best := chosen(null, base, stages[-1].scores)) is not None:
             base = self._sharpened(best.trial)
-            if len(base.hypothesis.candidates) == MOST_EFFECTS:
+            if len(base.hypothesis.candidates) == min(MOST_EFFECTS, len(self.candidates)):
                 break
             stages.append(self._polished(self.stage(base)))
             base = stages[-1].base
@@ -135,9 +147,13 @@ class Search:
         does must be linear, as it is not where contacts are made or motion is chaotic; and a model that is far off
         gets lost on the way.
         """
-        misfit = Misfit(base.hypothesis, longer.fitted)
-        noise = Noise.of(base.sensor_noise, np.zeros((1, *longer.fitted.measured.shape)))
-        return base.excess < LARGE and misfit.with_noise(noise).bent_by_starts(base.fit.u) < EXPLAINED - 1
+        if base.excess >= LARGE:
+            return False
+        for windows in (longer.fitted, longer.held_out):
+            noise = Noise.of(base.sensor_noise, np.zeros((1, *windows.measured.shape)))
+            if Misfit(base.hypothesis, windows).with_noise(noise).bent_by_starts(base.fit.u) > BENT:
+                return False
+        return True
 
     def base(self, effects: Sequence[Candidate] = (), start: Array | None = None) -> Base:
         """The hypothesis of some effects, fitted with all its differences."""

@@ -49,13 +49,18 @@ class Score:
         return self.fitted + self.held_out
 
     @property
+    def was_stood_in_for(self) -> bool:
+        """Whether plain parameters were farther off without it than they ever are."""
+        return self.of_prior > 0.5 * FAR**2
+
+    @property
     def earned(self) -> bool:
         """Whether it may be called missing: it must show in what was fitted, and in recordings that no fit saw.
 
         Less is asked of an effect that plain parameters can stand in for: all it can show is how far they had to go.
         """
-        stood_in_for = self.candidate.effect.name in SPEAKS_FOR.values() and self.of_prior > 0.5 * FAR**2
-        least, in_all = (0.0, 0.0) if stood_in_for else (EVIDENCE_EACH, EVIDENCE)
+        all_it_can = self.candidate.effect.name in SPEAKS_FOR.values() and self.was_stood_in_for
+        least, in_all = (0.0, 0.0) if all_it_can else (EVIDENCE_EACH, EVIDENCE)
         return (
             min(self.fitted, self.held_out) > least
             and self.total > in_all
@@ -77,7 +82,7 @@ def chosen(null: Base, base: Base, scores: Sequence[Score]) -> Score | None:
         earned = [
             s
             for s in earned
-            if base.excess > right > s.trial.excess or base.excess - s.trial.excess > least or s.of_prior > 0.5 * FAR**2
+            if base.excess > right > s.trial.excess or base.excess - s.trial.excess > least or s.was_stood_in_for
         ]
     if not earned:
         return None

@@ -59,5 +59,9 @@ CONFOUNDED = 0.9
 WINDOW = 0.5
 """Seconds of a window."""
 
+BENT = 0.1
+"""Mean square, in units of the sensors' noise, of what uncertain starts do to whole recordings beyond the linear, up
+to which these are fitted."""
+
 LONG_WINDOW = 4.0
 """Seconds of a window at most, where the model is near enough to the data for whole recordings to be predicted."""

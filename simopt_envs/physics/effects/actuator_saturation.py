@@ -42,6 +42,9 @@ class ActuatorSaturation(Effect):
         return (Parameter("limit", drive_unit(model, drive), limit, 1e-9 * limit, 10 * limit, "log", (write,)),)
 
     def probes(self, model: mujoco.MjModel, place: str, motion: Motion) -> tuple[dict[str, float], ...]:
-        """Limits below the greatest force, which is one to three times the root mean square."""
+        """Limits below the greatest force, which is one to three times the root mean square.
+
+        And far below: what a servo asks for where it is held back, and cannot follow, has no bound.
+        """
         force = drive_force(model, object_name(place), motion)
-        return tuple({"limit": part * force} for part in (0.7, 1.0, 1.4, 2.0, 3.0))
+        return tuple({"limit": part * force} for part in (0.03, 0.1, 0.3, 0.7, 1.0, 1.4, 2.0, 3.0))

@@ -1,0 +1,118 @@
+"""How much of a recording is predicted in one go, and what errors in parts of it tell."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from conftest import needs_effects
+from gap_plant import MODEL, record
+
+from simopt_envs.gap import find_gap
+from simopt_envs.gap.fit import by_part
+from simopt_envs.gap.hypothesis import Candidate
+from simopt_envs.gap.motion import motion_of
+from simopt_envs.gap.plain import plain_parameters
+from simopt_envs.gap.recordings import read_windows, whole_recordings
+from simopt_envs.gap.result import judge
+from simopt_envs.gap.search import Search
+from simopt_envs.measured import Recording, WindowSimulator, cut_windows
+from simopt_envs.measured.replay import start_curvature
+from simopt_envs.physics.effects import EFFECTS
+
+LOOSE = """
+<mujoco>
+  <option timestep="0.002" integrator="implicitfast" gravity="0 0 {gravity}"/>
+  <worldbody>
+    <body name="rod">
+      <joint name="hinge" axis="0 1 0" damping="0.01"/>
+      <geom type="capsule" fromto="0 0 0 0 0 0.5" size="0.02" mass="1"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="hinge" joint="hinge"/></actuator>
+</mujoco>
+"""
+
+
+def part(recording: Recording, kept: np.ndarray) -> Recording:
+    columns = {name: values[kept] for name, values in recording.columns.items()}
+    return replace(recording, time=recording.time[kept], columns=columns)
+
+
+def test_errors_are_summed_over_the_parts_of_each_window():
+    values = np.arange(2 * 7 * 3.0).reshape(2, 7, 3)
+    summed = by_part(values, 3)
+    assert summed.shape == (6, 3)
+    np.testing.assert_allclose(summed[:3].sum(axis=0), values[0].sum(axis=0))
+    np.testing.assert_allclose(summed[0], values[0, :2].sum(axis=0))
+    np.testing.assert_allclose(by_part(values, 1), values.sum(axis=1))
+
+
+@pytest.mark.parametrize(("gravity", "bends"), [(0.0, False), (-9.81, True)])
+def test_uncertain_starts_act_linearly_unless_motion_runs_apart(gravity, bends):
+    model = mujoco.MjModel.from_xml_string(LOOSE.format(gravity=gravity))
+    time = np.linspace(0.0, 2.0, 201)
+    angle = 0.1 * np.random.default_rng(0).standard_normal(201)  # upright, whence it falls to either side
+    windows = cut_windows(model, Recording(time, {"ctrl/hinge": np.zeros(201), "qpos/hinge": angle}))
+    curvature = start_curvature(model, WindowSimulator(model, windows))
+    largest = float(np.abs(curvature).max())
+    assert largest > 0.1 if bends else largest < 1e-6
+
+
+@needs_effects
+def test_whole_recordings_are_of_equal_parts_no_longer_than_four_seconds():
+    model = mujoco.MjModel.from_xml_string(MODEL)
+    recordings = record(lambda q, v: np.zeros(2), np.random.default_rng(0), count=4, seconds=6.0)
+    data = read_windows(model, recordings)
+    whole = whole_recordings(model, data)
+    assert whole is not None
+    assert (whole.seconds, whole.parts) == (pytest.approx(3.0), 6)
+    assert len(whole.fitted) == 4 * len(data.fitted) // 24
+    one = whole_recordings(model, read_windows(model, [part(r, r.time < 3.51) for r in recordings]))
+    assert one is not None
+    assert one.seconds == pytest.approx(3.5)
+
+
+@needs_effects
+def test_recordings_with_gaps_and_short_ones_stay_in_short_windows():
+    model = mujoco.MjModel.from_xml_string(MODEL)
+    recordings = record(lambda q, v: np.zeros(2), np.random.default_rng(0), count=4, seconds=3.0)
+    assert whole_recordings(model, read_windows(model, [part(r, r.time < 0.81) for r in recordings])) is None
+    torn = [part(r, (r.time < 1.5) | (r.time > 2.0)) for r in recordings]
+    assert whole_recordings(model, read_windows(model, torn)) is None
+
+
+@needs_effects
+@pytest.mark.parametrize(("torque", "seconds"), [(0.0, 2.0), (0.01, 2.0), (8.0, 0.5)])
+def test_whole_recordings_are_fitted_where_the_model_is_near(torque, seconds):
+    recordings = record(lambda q, v: np.array([0.0, -torque * np.tanh(v[1] / 0.01)]), np.random.default_rng(1))
+    plain = plain_parameters(mujoco.MjSpec.from_string(MODEL))
+    data = read_windows(plain.model, recordings)
+    motion, whole = motion_of(plain.model, recordings), whole_recordings(plain.model, data)
+    friction = Candidate(EFFECTS["coulomb_friction"], "joint:elbow")
+    assert Search(plain, data, motion, (friction,), whole=whole).run().data.seconds == pytest.approx(seconds)
+
+
+@needs_effects
+def test_a_search_needs_something_to_look_for():
+    recordings = record(lambda q, v: np.zeros(2), np.random.default_rng(1))
+    with pytest.raises(ValueError, match="none of the effects can act"):
+        find_gap(mujoco.MjSpec.from_string(MODEL), recordings, effects=[EFFECTS["contact_friction"]])
+
+
+@pytest.mark.parametrize(
+    ("of_plain", "left", "verdict"),
+    [(0.0, 0.3, "unexplained"), (300.0, 0.3, "partly"), (0.0, 0.1, "named"), (0.0, 1.0, "unexplained")],
+)
+def test_an_effect_that_plain_parameters_stood_in_for_explains_them_where_a_gap_is_left(of_plain, left, verdict):
+    explanation: Any = SimpleNamespace(
+        effects=("gain",),
+        null=SimpleNamespace(excess=0.3),
+        final=SimpleNamespace(excess=left),
+        scores={"gain": SimpleNamespace(was_stood_in_for=of_plain > 100)},
+    )
+    assert judge(explanation) == verdict
