@@ -151,14 +151,20 @@ class Misfit:
         starts = start_sensitivity(self.hypothesis.model, self._simulate, self.hypothesis.xi(u[None]))
         return Noise.of(scale, np.where(self._counted, np.nan_to_num(starts), 0.0))
 
-    def bent_by_starts(self, u: Array) -> float:
-        """What the noise does not tell of uncertain starts at u (d,), as they act on windows linearly there alone.
+    def of_starts(self, u: Array, scale: Array) -> tuple[float, float]:
+        """What uncertain starts make of windows at u (d,), mean squares in units of a noise (c,).
 
-        That is a mean square, in units of the noise of sensors.
+        Returns:
+            What they make of the second half of the median window, and what in all windows is not linear in them,
+            and so not in the noise; infinite where a simulation ran away.
         """
-        curvature = start_curvature(self.hypothesis.model, self._simulate, self.hypothesis.xi(u[None]))
-        bent = np.where(self._counted, np.nan_to_num(curvature, nan=np.inf), 0.0) / self.noise.scale
-        return float(np.mean(np.sum(bent**2, axis=0)))
+        given = self.hypothesis.model, self._simulate, self.hypothesis.xi(u[None])
+        made, bent = (
+            np.where(self._counted, np.sum((changes / scale) ** 2, axis=0), 0.0)
+            for changes in (start_sensitivity(*given), start_curvature(*given))
+        )
+        late = np.median(np.mean(made[:, made.shape[1] // 2 :], axis=(1, 2)))
+        return float(np.nan_to_num(late, nan=np.inf)), float(np.nan_to_num(np.mean(bent), nan=np.inf))
 
     def noise_floor(self, u: Array) -> Array:
         """Standard deviation of the part of the errors at u (d,) that one sample does not share with the next, (c,).

@@ -19,7 +19,7 @@ from simopt_envs.gap.kept import kept_fits, key_of
 from simopt_envs.gap.large import of_fine_size, of_rough_size, of_some_size
 from simopt_envs.gap.plain import SPEAKS_FOR, Plain
 from simopt_envs.gap.selection import Score, chosen, score_of, tolerance_of, worth_of
-from simopt_envs.gap.thresholds import BENT, FAR, LARGE, LARGE_REFITTED, MOST_EFFECTS, REFITTED
+from simopt_envs.gap.thresholds import BENT, FAR, FORGOTTEN, LARGE, LARGE_REFITTED, MOST_EFFECTS, REFITTED
 from simopt_envs.gap.trial import Base, Data, Screened, Trial
 from simopt_envs.measured.windows import Windows
 from simopt_envs.physics.effects import Motion
@@ -143,15 +143,15 @@ class Search:
     def _predicts(base: Base, longer: Data) -> bool:
         """Whether a base is near enough to the data to be held against longer windows of them.
 
-        They tell more, as what a model lacks adds up and as fewer starts are uncertain. But what an uncertain start
-        does must be linear, as it is not where contacts are made or motion is chaotic; and a model that is far off
-        gets lost on the way.
+        They tell more, as what a model lacks adds up and as fewer starts are uncertain. But a start must be forgotten,
+        as where servos hold a robot, or a small error grows into a large one; what it does must be linear, as it is not
+        where contacts slip; and a model that is far off gets lost on the way.
         """
         if base.excess >= LARGE:
             return False
         for windows in (longer.fitted, longer.held_out):
-            noise = Noise.of(base.sensor_noise, np.zeros((1, *windows.measured.shape)))
-            if Misfit(base.hypothesis, windows).with_noise(noise).bent_by_starts(base.fit.u) > BENT:
+            made, bent = Misfit(base.hypothesis, windows).of_starts(base.fit.u, base.sensor_noise)
+            if made > FORGOTTEN or bent > BENT:
                 return False
         return True
 

@@ -59,6 +59,10 @@ CONFOUNDED = 0.9
 WINDOW = 0.5
 """Seconds of a window."""
 
+FORGOTTEN = 100.0
+"""Mean square, in units of the sensors' noise, of what uncertain starts make of the second half of the median recording
+up to which whole recordings are fitted: where nothing holds a joint it is thousands."""
+
 BENT = 0.1
 """Mean square, in units of the sensors' noise, of what uncertain starts do to whole recordings beyond the linear, up
 to which these are fitted."""
