@@ -296,6 +296,17 @@ def test_update_rules_and_ablations_name_the_best_and_the_worse(pages):
     assert "15 cm, open loop: worse; the same seeds end 9.2 [9.1, 9.3] cm farther off" in pages[0]["ablations"]
 
 
+@pytest.mark.parametrize(("seeds", "verdict"), [(2, "2 seeds, too few to tell"), (5, "worse")])
+def test_a_few_seeds_that_agree_tell_nothing(seeds, verdict):
+    errors = {"nothing left out": 0.01, "open loop": 0.02}
+    results = {
+        ablations._condition(name, 0.15): {seed: {"cabinet_x_error": error} for seed in range(seeds)}
+        for name, error in errors.items()
+    }
+    (finding,) = ablations._findings(results)
+    assert finding.startswith(f"15 cm, open loop: {verdict}; ")
+
+
 def test_tables_are_markdown():
     table = Table("Caption.", ["a", "b"], [["1", "2"]])
     assert table.markdown() == "Caption.\n\n| a | b |\n| --- | --- |\n| 1 | 2 |"

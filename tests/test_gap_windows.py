@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -18,7 +16,6 @@ from simopt_envs.gap.hypothesis import Candidate
 from simopt_envs.gap.motion import motion_of
 from simopt_envs.gap.plain import plain_parameters
 from simopt_envs.gap.recordings import read_windows, whole_recordings
-from simopt_envs.gap.result import judge
 from simopt_envs.gap.search import Search
 from simopt_envs.measured import Recording, WindowSimulator, cut_windows
 from simopt_envs.measured.replay import start_curvature
@@ -102,17 +99,3 @@ def test_a_search_needs_something_to_look_for():
     recordings = record(lambda q, v: np.zeros(2), np.random.default_rng(1))
     with pytest.raises(ValueError, match="none of the effects can act"):
         find_gap(mujoco.MjSpec.from_string(MODEL), recordings, effects=[EFFECTS["contact_friction"]])
-
-
-@pytest.mark.parametrize(
-    ("of_plain", "left", "verdict"),
-    [(0.0, 0.3, "unexplained"), (300.0, 0.3, "partly"), (0.0, 0.1, "named"), (0.0, 1.0, "unexplained")],
-)
-def test_an_effect_that_plain_parameters_stood_in_for_explains_them_where_a_gap_is_left(of_plain, left, verdict):
-    explanation: Any = SimpleNamespace(
-        effects=("gain",),
-        null=SimpleNamespace(excess=0.3),
-        final=SimpleNamespace(excess=left),
-        scores={"gain": SimpleNamespace(was_stood_in_for=of_plain > 100)},
-    )
-    assert judge(explanation) == verdict

@@ -14,7 +14,7 @@ from baselines.experiments.cell import Cell, Result, Results
 from baselines.experiments.document import Question, Table
 from baselines.experiments.drawing import draw_curve, draw_points, new_figure
 from baselines.experiments.fits import LEAST_XI, LOCATED, Problem, adapt
-from baselines.experiments.statistics import mean_of
+from baselines.experiments.statistics import FEWEST_SEEDS, mean_of
 from baselines.experiments.workspace import Workspace
 from simopt_envs.adaptation import REPS, Policy, Rollouts, Simulator
 from simopt_envs.adaptation.updates import Update, UpdateResult
@@ -203,6 +203,7 @@ def _findings(results: Results) -> list[str]:
             if pairs:
                 more = mean_of([100 * (a - b) for a, b in pairs])
                 verdict = "worse" if more.low > 0 else "better" if more.high < 0 else "not told apart"
+                verdict = verdict if more.seeds >= FEWEST_SEEDS else f"{more.seeds} seeds, too few to tell"
                 found.append(
                     f"{100 * shift:.0f} cm, {name}: {verdict}; the same seeds end {more.text()} cm farther off than"
                     " with nothing left out."

@@ -196,18 +196,13 @@ def _motion(effect: Candidate, partner: Partner) -> dict[str, Any] | None:
 
 
 def judge(explanation: Explanation) -> Verdict:
-    """The verdict on a search, from what is left on recordings that no fit saw.
-
-    An effect that plain parameters stood in for takes little of the gap: it takes them back to where they belong.
-    """
+    """The verdict on a search, from what is left on recordings that no fit saw."""
     left, right = explanation.final.excess, EXPLAINED - 1
     if not explanation.effects:
         return "none" if left < right else "unexplained"
     if left < right:
         return "named"
-    stood_in_for = any(explanation.scores[effect].was_stood_in_for for effect in explanation.effects)
-    helped = stood_in_for or left < (1 - LEAST_SHARE) * explanation.null.excess
-    return "partly" if helped else "unexplained"
+    return "partly" if left < (1 - LEAST_SHARE) * explanation.null.excess else "unexplained"
 
 
 def named_effects(explanation: Explanation) -> tuple[Named, ...]:
@@ -218,7 +213,7 @@ def named_effects(explanation: Explanation) -> tuple[Named, ...]:
     spread = np.sqrt(final.fit.variance(max(1.0, mean_square), explanation.data.parts))
     ends = u + _NORMAL_95 * np.array([-spread, spread])
     xi, (low, high) = hypothesis.xi(u[None])[0], hypothesis.xi(ends)
-    scores = explanation.scores
+    scores = {score.candidate: score for stage in explanation.stages for score in stage.scores}
     return tuple(
         Named(
             candidate,

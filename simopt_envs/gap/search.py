@@ -73,11 +73,6 @@ class Explanation:
         """What is missing."""
         return self.final.hypothesis.candidates
 
-    @property
-    def scores(self) -> dict[Candidate, Score]:
-        """What candidates earned in the last stage they were fitted in: effects, in that which added them."""
-        return {score.candidate: score for stage in self.stages for score in stage.scores}
-
 
 class Search:
     """A search on one set of data.
