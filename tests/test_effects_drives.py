@@ -241,6 +241,14 @@ def test_actuator_saturation_starts_at_the_limit_that_the_model_has():
     np.testing.assert_allclose(model.actuator("drive").forcerange, [-0.2, 0.15])
 
 
+def test_small_limits_are_tried_where_a_servo_is_held_back():
+    model, still = plain(), np.zeros(4)
+    asked = Motion(still - 0.1, still + 0.1, still + 1, still + 40.0, np.zeros(3))  # kp x error, and none of it arrives
+    tried = [probe["limit"] for probe in EFFECTS["actuator_saturation"].probes(model, "actuator:elbow", asked)]
+    assert min(tried) == pytest.approx(1.2)
+    assert max(tried) == pytest.approx(120)
+
+
 def dead_zone(error, width):
     return np.sign(error) * np.maximum(np.abs(error) - width, 0)
 
