@@ -73,7 +73,7 @@ def test_the_repaired_model_is_plain_mujoco_and_predicts_what_the_workflow_says(
     folder = friction_gap.save(tmp_path / "out")
     repaired = mujoco.MjModel.from_xml_path(str(folder / "model.repaired.xml"))
     assert repaired.joint("elbow").frictionloss[0] > 0.1
-    windows = cut_windows(repaired, friction_gap.data.held_out_recordings, 0.5)
+    windows = cut_windows(repaired, friction_gap.data.held_out_recordings, friction_gap.data.seconds)
     # MJCF has no delay below one timestep, and six digits: the same to a fraction of the noise.
     error = simulate_windows(repaired, windows)[0] - friction_gap.errors.simulated[2]
     assert np.sqrt(np.mean(error[..., :2] ** 2)) < 4e-3  # of a spread of 0.4 rad

@@ -95,7 +95,8 @@ def _silent_warnings() -> Iterator[None]:
         mujoco.set_mju_user_warning(before)
 
 
-def _gap(given: mujoco.MjSpec, explanation: Explanation, data: Data, keyframe: str | None, began: float) -> Gap:
+def _gap(given: mujoco.MjSpec, explanation: Explanation, short: Data, keyframe: str | None, began: float) -> Gap:
+    """What was found; where the model errs, and on what that depends, is told from short windows in any case."""
     null, final = explanation.null, explanation.final
     verdict = judge(explanation)
     if verdict == "unexplained":
@@ -103,15 +104,15 @@ def _gap(given: mujoco.MjSpec, explanation: Explanation, data: Data, keyframe: s
     as_given = null.hypothesis.space.nominal
     fitted = [base.hypothesis.xi(base.fit.u[None])[0] for base in (null, final)]
     models = [(null.hypothesis, as_given), (null.hypothesis, fitted[0]), (final.hypothesis, fitted[1])]
-    errors = held_out_errors(data.held_out, models, null.sensor_noise, np.random.default_rng(_SEED))
+    errors = held_out_errors(explanation.data.held_out, models, null.sensor_noise, np.random.default_rng(_SEED))
     explained = replace(explanation, final=final)
     spec, diff = repair(explained, given, fitted[1])
-    rows = localise(data.held_out, _left_by(null, data.held_out).errors, null.hypothesis.plain.model)
-    residuals = [_left_by(final, windows) for windows in (data.fitted, data.held_out)]
+    rows = localise(short.held_out, _left_by(null, short.held_out).errors, null.hypothesis.plain.model)
+    residuals = [_left_by(final, windows) for windows in (short.fitted, short.held_out)]
     left = describe(final.hypothesis, final.fit.u, residuals)
     named = separate(named_effects(explained), explained, keyframe)
     seconds = time.perf_counter() - began
-    return Gap(verdict, named, errors, rows, left, explained, data, spec, diff, seconds)
+    return Gap(verdict, named, errors, rows, left, explained, explanation.data, spec, diff, seconds)
 
 
 def _left_by(base: Base, windows: Windows) -> Residual:

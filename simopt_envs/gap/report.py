@@ -237,7 +237,6 @@ def settings(gap: Gap) -> Section:
         "fitted": f"{len(fitted)} windows of {', '.join(r.name for r in gap.data.fitted_recordings)}",
         "held out": f"{len(held_out)} windows of {', '.join(r.name for r in gap.data.held_out_recordings)}",
         "window": f"{gap.data.seconds:g} s, {len(fitted.offsets)} samples of {len(fitted.channels)} channels",
-        "window of fits": f"{gap.explanation.data.seconds:g} s",
         **{name: f"{getattr(thresholds, name):g}" for name in sorted(vars(thresholds)) if name.isupper()},
         "time": f"{gap.seconds:.0f} s",
         **installed_versions(),

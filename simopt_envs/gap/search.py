@@ -87,9 +87,6 @@ class Search:
         directory: keeps finished fits, from which a search of the same goes on; None for none.
         whole: the recordings in longer windows, which are fitted instead where the model predicts as much; None for
             never.
-
-    Raises:
-        ValueError: without candidates.
     """
 
     def __init__(
@@ -103,10 +100,6 @@ class Search:
         directory: str | Path | None = None,
         whole: Data | None = None,
     ):
-        if not candidates:
-            raise ValueError(
-                "there is nothing to search: none of the effects can act in this model and show in its data"
-            )
         self.plain, self.data, self.motion, self.candidates = plain, data, motion, tuple(candidates)
         self._whole, self._progress, self._engine = whole, progress, engine or LocalEngine()
         self._kept = kept_fits(directory, plain, motion, data.fitted, data.held_out)
@@ -115,7 +108,15 @@ class Search:
         self._largest: dict[tuple[Candidate, ...], list[Candidate]] = {}
 
     def run(self) -> Explanation:
-        """Add effects while they earn it, then take away those that the others have made needless."""
+        """Add effects while they earn it, then take away those that the others have made needless.
+
+        Raises:
+            ValueError: without candidates.
+        """
+        if not self.candidates:
+            raise ValueError(
+                "there is nothing to search: none of the effects can act in this model and show in its data"
+            )
         base = self.base()
         if self._whole is not None and self._predicts(base, self._whole):
             self.data = self._whole
