@@ -11,12 +11,13 @@ from conftest import needs_effects
 from gap_plant import MODEL, record
 
 from simopt_envs.gap import find_gap
-from simopt_envs.gap.fit import by_part
+from simopt_envs.gap.fit import Misfit, by_part
 from simopt_envs.gap.hypothesis import Candidate
 from simopt_envs.gap.motion import motion_of
 from simopt_envs.gap.plain import plain_parameters
 from simopt_envs.gap.recordings import read_windows, whole_recordings
 from simopt_envs.gap.search import Search
+from simopt_envs.gap.thresholds import BENT, FORGOTTEN
 from simopt_envs.measured import Recording, WindowSimulator, cut_windows
 from simopt_envs.measured.replay import start_curvature
 from simopt_envs.physics.effects import EFFECTS
@@ -92,6 +93,32 @@ def test_whole_recordings_are_fitted_where_the_model_is_near(torque, seconds):
     motion, whole = motion_of(plain.model, recordings), whole_recordings(plain.model, data)
     friction = Candidate(EFFECTS["coulomb_friction"], "joint:elbow")
     assert Search(plain, data, motion, (friction,), whole=whole).run().data.seconds == pytest.approx(seconds)
+
+
+@needs_effects
+@pytest.mark.parametrize(("gravity", "forgotten", "linear"), [(0.0, False, True), (-9.81, False, False)])
+def test_a_right_model_stays_in_short_windows_where_a_start_is_not_forgotten(gravity, forgotten, linear):
+    rng, time = np.random.default_rng(0), 0.01 * np.arange(201)
+    spec = mujoco.MjSpec.from_string(LOOSE.format(gravity=gravity))
+    plain = plain_parameters(spec)
+    recordings = []
+    for i in range(4):
+        data, torque, angle = mujoco.MjData(plain.model), 0.3 * np.sin((i + 2) * time), np.empty(201)
+        data.qpos[:] = 0.1 * (i - 1.5)  # upright, whence it falls to either side
+        for k in range(201):
+            angle[k] = data.qpos[0] + 1e-3 * rng.standard_normal()
+            data.ctrl[:] = torque[k]
+            mujoco.mj_step(plain.model, data, 5)
+        recordings.append(Recording(time, {"ctrl/hinge": torque, "qpos/hinge": angle}, f"run_{i}"))
+    data = read_windows(plain.model, recordings)
+    friction = Candidate(EFFECTS["coulomb_friction"], "joint:hinge")
+    whole = whole_recordings(plain.model, data)
+    search = Search(plain, data, motion_of(plain.model, recordings), (friction,), whole=whole)
+    base = search.base()
+    made, bent = Misfit(base.hypothesis, whole.fitted).of_starts(base.fit.u, base.sensor_noise)
+    assert base.excess < 0.25
+    assert ((made < FORGOTTEN), (bent < BENT)) == (forgotten, linear)
+    assert search.run().data.seconds == pytest.approx(0.5)
 
 
 @needs_effects

@@ -112,7 +112,7 @@ def _gap(given: mujoco.MjSpec, explanation: Explanation, short: Data, keyframe: 
     left = describe(final.hypothesis, final.fit.u, residuals)
     named = separate(named_effects(explained), explained, keyframe)
     seconds = time.perf_counter() - began
-    return Gap(verdict, named, errors, rows, left, explained, explanation.data, spec, diff, seconds)
+    return Gap(verdict, named, errors, rows, left, explained, spec, diff, seconds)
 
 
 def _left_by(base: Base, windows: Windows) -> Residual:

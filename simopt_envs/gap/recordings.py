@@ -79,6 +79,8 @@ def whole_recordings(model: mujoco.MjModel, data: Data, keyframe: str | None = N
     shortest = min(r.duration for r in (*data.fitted_recordings, *data.held_out_recordings))
     samples = int(shortest / period + 1e-6)
     seconds = samples // int(np.ceil(samples * period / LONG_WINDOW)) * period
+    if seconds < 2 * data.seconds:
+        return None
 
     def longer(windows: Windows, recordings: Sequence[Recording]) -> Windows | None:
         try:
@@ -89,9 +91,7 @@ def whole_recordings(model: mujoco.MjModel, data: Data, keyframe: str | None = N
 
     fitted = longer(data.fitted, data.fitted_recordings)
     held_out = longer(data.held_out, data.held_out_recordings)
-    if seconds < 2 * data.seconds or fitted is None or held_out is None:
-        return None
-    return replace(data, fitted=fitted, held_out=held_out)
+    return None if fitted is None or held_out is None else replace(data, fitted=fitted, held_out=held_out)
 
 
 def _liveliness(recording: Recording) -> float:

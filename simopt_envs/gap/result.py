@@ -70,7 +70,6 @@ class Gap:
         localisation: where the refitted model and the recordings disagree, largest share first.
         left: what the part that is not explained depends on.
         explanation: the search behind it.
-        data: the recordings.
         spec: the repaired model.
         diff: its difference to the model as given.
         seconds: that it took.
@@ -82,10 +81,14 @@ class Gap:
     localisation: tuple[Row, ...]
     left: Description
     explanation: Explanation
-    data: Data
     spec: mujoco.MjSpec
     diff: str
     seconds: float
+
+    @property
+    def data(self) -> Data:
+        """The recordings, in the windows that were fitted and held out."""
+        return self.explanation.data
 
     @property
     def warnings(self) -> tuple[Finding, ...]:
