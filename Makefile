@@ -20,7 +20,7 @@ experiments: $(VENV)
 	.venv/bin/python -m baselines.experiments
 
 experiments-quick: $(VENV)
-	.venv/bin/python -m baselines.experiments --quick --docs out/experiments/docs
+	.venv/bin/python -m baselines.experiments --quick
 
 # The gap workflow on systems in which an effect is hidden; it never sees the folder of labels.
 HIDDEN := out/hidden_effects

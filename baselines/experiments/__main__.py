@@ -32,9 +32,10 @@ class Experiments:
     quick: bool = False
     """Only a part: fewer seeds and conditions."""
     out: Path = Path("out/experiments")
-    """Folder for results, policies and runs of SimOpt. The machines of a Ray cluster must share it."""
-    docs: Path = Path("docs/experiments")
-    """Folder for the pages and figures."""
+    """Folder for policies and runs of SimOpt. The machines of a Ray cluster must share it, and that of the pages."""
+    docs: Path | None = None
+    """Folder for the pages and figures and, in cells, the results that they are made of: docs/experiments, or with
+    --quick or --smoke OUT/docs."""
     report: bool = False
     """Run nothing; write the pages of what is finished."""
     smoke: bool = False
@@ -52,14 +53,15 @@ class Experiments:
         """Run and write; the exit code."""
         effort = SMOKE if self.smoke else Effort()
         out = self.out.resolve()  # workers have another working directory
-        store = Store(out / "cells", effort)
+        docs = self.docs or (out / "docs" if self.quick or self.smoke else Path("docs/experiments"))
+        store = Store(docs.resolve() / "cells", effort)
         chosen = [QUESTIONS[name] for name in self.questions or QUESTIONS]
         failed = []
         if not self.report:
             cells = [cell for question in chosen for cell in question.cells() if cell.quick or not self.quick]
             failed = run_cells(cells, store, lambda tell: Workspace(out, effort, tell), engine=self.where.make())
         for question in chosen:
-            page = write_document(question, store, self.docs)
+            page = write_document(question, store, docs)
             print(f"{question.name}: {page or 'nothing is finished yet'}")
         return 1 if failed else 0
 
