@@ -12,7 +12,7 @@ import pytest
 from scipy.io import savemat
 
 from simopt_envs.measured import LogMapping, Recording, Source, load_recording, load_recordings
-from simopt_envs.measured.resample import band_limited, hold, resolution, smooth
+from simopt_envs.measured.resample import band_limited, hold
 
 EXAMPLES = Path(__file__).parents[1] / "simopt_envs" / "measured" / "examples"
 
@@ -131,38 +131,6 @@ def test_select_split_and_windows():
     assert all(len(w) == 101 for w in windows)
     holed = Recording(np.delete(recording.time, np.s_[450:470]), {"qpos/a": np.zeros(980)})
     assert [round(w.time[0], 2) for w in holed.windows(1.0)] == [0, 1, 2, 3, 5, 6, 7, 8]
-
-
-def test_smoothing_finds_velocity_and_how_wrong_it_may_be():
-    rng = np.random.default_rng(1)
-    time = np.arange(3000) / 500
-    position, velocity = np.sin(4 * time), 4 * np.cos(4 * time)
-    smoothed = smooth(position + rng.normal(0, 1e-3, 3000), 1 / 500)
-    assert smoothed.noise == pytest.approx(1e-3, rel=0.1)
-    inside = slice(100, -100)
-    error = np.std(smoothed.velocity[inside] - velocity[inside])
-    assert error < np.std(np.gradient(position + rng.normal(0, 1e-3, 3000), 1 / 500) - velocity) / 20
-    assert 0.7 < error / smoothed.velocity_error[100] < 1.5
-    assert 0.7 < np.std(smoothed.value[inside] - position[inside]) / smoothed.value_error[100] < 1.5
-
-
-def test_smoothing_sees_across_the_counts_of_an_encoder():
-    time = np.arange(5000) / 1000
-    count = 2 * np.pi / 4000
-    rounded = np.round(0.3 * np.sin(time) / count) * count
-    assert resolution(rounded) == pytest.approx(count)
-    smoothed = smooth(rounded, 1e-3)
-    assert smoothed.noise == pytest.approx(count / np.sqrt(12), rel=0.15)
-    assert np.std(smoothed.velocity - 0.3 * np.cos(time)) < 0.02  # a difference quotient: 0.7
-
-
-def test_smoothing_leaves_missing_samples_missing():
-    values = np.sin(np.arange(200) / 20)
-    values[50:55] = np.nan
-    smoothed = smooth(values, 0.05)
-    np.testing.assert_array_equal(np.isnan(smoothed.velocity), np.isnan(values))
-    with pytest.raises(ValueError, match="at least 5 samples, got 3"):
-        smooth(np.zeros(3), 0.1)
 
 
 # --- mappings -------------------------------------------------------------------------------------------------------

@@ -181,15 +181,16 @@ def test_a_simulator_gives_the_same_whatever_it_ran_before(monkeypatch):
         simulator([[20.0]])
 
 
-def test_estimated_starts_are_as_right_as_they_say():
-    """Positions with 1 mrad of noise, no velocity measured; the error of the velocity is that which is claimed."""
+@pytest.mark.parametrize(("left_out", "noise"), [(["qvel"], {"qpos": 1e-3}), ([], {"qpos": 1e-3, "qvel": 0.1})])
+def test_estimated_starts_are_as_right_as_they_say(left_out, noise):
+    """Positions with 1 mrad of noise, velocities not measured or badly; the errors are those that are claimed."""
     model = cart()
     recording, qpos, qvel = record(model, 3000)
     rng = np.random.default_rng(0)
-    noisy = without(recording, "qvel", "sensor", "site")
+    noisy = without(recording, "sensor", "site", *left_out)
     noisy = replace(
         noisy,
-        columns={n: v + rng.normal(0, 1e-3, len(v)) * n.startswith("qpos") for n, v in noisy.columns.items()},
+        columns={n: v + rng.normal(0, noise.get(n.split("/")[0], 0), len(v)) for n, v in noisy.columns.items()},
     )
     samples = np.arange(100, 2900, 20)
     states = estimate_states(model, noisy, samples)

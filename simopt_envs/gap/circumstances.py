@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_opening
 
 from simopt_envs.measured.channels import Channel
-from simopt_envs.measured.resample import smooth
+from simopt_envs.measured.smoothing import smooth
 from simopt_envs.measured.windows import Windows, simulate_windows
 from simopt_envs.physics.effects import object_name
 from simopt_envs.physics.effects.joints import dof, scalar_joints

@@ -10,7 +10,8 @@ from scipy import signal
 
 from simopt_envs.measured.channels import Channel, model_channels
 from simopt_envs.measured.recording import Finding, Recording
-from simopt_envs.measured.resample import Array, Smoothed, smooth
+from simopt_envs.measured.resample import Array
+from simopt_envs.measured.smoothing import Smoothed, smooth
 from simopt_envs.physics.parameters import unknown_name
 
 LEAST_SAMPLES = 20  # fewer cannot be smoothed, let alone fitted

@@ -11,11 +11,13 @@ from scipy.optimize import least_squares
 
 from simopt_envs.measured.channels import Channel, model_channels, read_channels
 from simopt_envs.measured.recording import Recording
-from simopt_envs.measured.resample import Array, Smoothed, smooth
+from simopt_envs.measured.resample import Array
+from simopt_envs.measured.smoothing import Smoothed, smooth, smooth_with_rate
 from simopt_envs.physics.parameters import unknown_name
 
 _POSITION_PRIOR = 1.0  # sd of an unmeasured joint around the reference [rad, m]: decides only what nothing sees
 _VELOCITY_PRIOR = 10.0  # the same of its velocity around rest [rad/s, m/s]
+_SCALAR = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE))
 _LEAST_ERROR = 1e-6  # no measurement counts as more exact than this
 
 
@@ -57,10 +59,10 @@ def estimate_states(
 ) -> States:
     """Estimate the states at some samples of a uniformly sampled recording.
 
-    Measured positions and velocities are smoothed; velocities that were not measured are derivatives of the smoothed
-    positions. Joints without a column are fitted, from the reference or keyframe, to the sites and sensors that depend
-    on positions, and their velocities to the rates of those and to velocity sensors; what nothing sees stays at the
-    reference, at rest.
+    Measured positions and velocities are smoothed, both of a hinge or slide together; velocities that were not measured
+    are derivatives of the smoothed positions. Joints without a column are fitted, from the reference or keyframe, to
+    the sites and sensors that depend on positions, and their velocities to the rates of those and to velocity sensors;
+    what nothing sees stays at the reference, at rest.
 
     Args:
         model: the model; its parameters matter only where joints are fitted to sites and sensors.
@@ -73,7 +75,11 @@ def estimate_states(
     """
     channels = model_channels(model)
     seen = [channels[name] for name in recording.signals if name in channels]
-    smoothed = {channel.name: smooth(recording[channel.name], recording.period) for channel in seen}
+    rate_of = {c.object: c for c in seen if c.kind == "qvel" and model.jnt_type[c.object] in _SCALAR}
+    paired = {c.name: rate_of[c.object] for c in seen if c.kind == "qpos" and c.object in rate_of}
+    smoothed = {c.name: smooth(recording[c.name], recording.period) for c in seen if c.name not in paired}
+    for name, rate in paired.items():
+        smoothed[name] = smooth_with_rate(recording[name], recording[rate.name], recording.period)
     qpos = np.tile(reference_qpos(model, keyframe), (len(samples), 1))
     rates = np.zeros_like(qpos)
     qpos_error = np.full((len(samples), model.nv), _POSITION_PRIOR)
@@ -93,7 +99,7 @@ def estimate_states(
     states = States(qpos, qvel, qpos_error, qvel_error)
     if unseen.any():
         _fit_unseen(model, states, np.flatnonzero(unseen), seen, smoothed, samples)
-    for channel in (c for c in seen if c.kind == "qvel"):
+    for channel in (c for c in seen if c.kind == "qvel" and c not in paired.values()):
         signal = smoothed[channel.name]
         measured = signal.value[samples]
         good = np.isfinite(measured)
