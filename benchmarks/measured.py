@@ -38,7 +38,6 @@ KG_M2, QUADRATIC = "kg m^2", "N m s^2/rad^2"
 PUBLISHED_EMPS = {"mass": 95.1089, "viscous": 203.5034, "coulomb": 20.3935, "offset": 3.1648}
 TOLERANCE_EMPS = {"mass": 0.03, "viscous": 0.03, "coulomb": 0.05, "offset": 0.10}
 RULES = ("reps", "cmaes", "least-squares")
-GAPS = ("emps", "double_pendulum", "free_swing")
 WINDOWS = (0.1, 0.5, 2.0)  # s, that least squares fits
 
 
@@ -58,8 +57,6 @@ class Args:
     """Sections to run."""
     rules: tuple[Literal["reps", "cmaes", "least-squares"], ...] = RULES
     """Update rules for the double pendulum."""
-    gaps: tuple[Literal["emps", "double_pendulum", "free_swing"], ...] = GAPS
-    """Recordings whose missing effects to name; their section then holds these alone."""
     out: Path = Path("docs/measured_results.md")
     """Where the tables are written, one section after the other; sections that are not run are kept."""
 
@@ -306,8 +303,7 @@ def gaps(args: Args) -> Iterator[str]:
         "double_pendulum": "Coulomb 0.093 and 0.078 N m, rotors 0.00358 kg m²",
         "free_swing": "",
     }
-    for folder in args.gaps:
-        names = files[folder]
+    for folder, names in files.items():
         spec = mujoco.MjSpec.from_file(str(EXAMPLES / f"{folder}.xml"))
         for joint in spec.joints:
             joint.armature = 0.0

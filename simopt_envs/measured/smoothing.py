@@ -118,9 +118,8 @@ def smooth_with_rate(position: Array, velocity: Array, period: float) -> Smoothe
     of_position = np.std(np.diff(_filled(position), 3)) / 20**0.5 / unit  # were it all noise
     of_velocity = np.std(np.diff(_filled(velocity), 2)) / 6**0.5 * period / unit
     start = np.log(np.maximum([of_position, of_velocity, of_position], _LEAST_NOISE))
-    sizes = optimize.minimize(
-        motion.improbability, start, method="Nelder-Mead", options={"xatol": 0.01, "fatol": 0.01}
-    ).x
+    found = optimize.minimize(motion.improbability, start, method="Nelder-Mead", options={"xatol": 0.01, "fatol": 0.01})
+    sizes = np.maximum(found.x, np.log(_LEAST_NOISE))
     value, root = motion.most_probable(sizes)
     variance = _band_of_inverse(root)
     velocity_variance = np.empty(len(value))
@@ -151,7 +150,7 @@ class _Motion:
 
     def most_probable(self, sizes: Array) -> tuple[Array, Array]:
         """x, and the Cholesky factor of its precision in lower banded form (4, T); LinAlgError where it has none."""
-        of_position, of_velocity, of_jerk = np.exp(-2 * np.maximum(sizes, np.log(_LEAST_NOISE)))
+        of_position, of_velocity, of_jerk = np.exp(-2 * sizes)
         positions, velocities = of_position * self._weights[0], of_velocity * self._weights[1]
         precision = np.zeros((4, len(positions)))
         precision[0] = positions
