@@ -45,10 +45,19 @@ def run_and_die(directory, die_at, resume):
 
 
 def without_clock(directory):
+    """Every number and text of a result by where it stands, so that a failure names those that differ."""
     result = json.loads((directory / "result.json").read_text())
     for entry in result["iterations"]:
         assert entry.pop("train_seconds") >= 0
-    return result
+    return dict(leaves(result))
+
+
+def leaves(value, where="result"):
+    if isinstance(value, dict | list):
+        for key, part in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from leaves(part, f"{where}.{key}")
+    else:
+        yield where, value
 
 
 @pytest.fixture(scope="module")
