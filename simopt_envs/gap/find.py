@@ -20,7 +20,7 @@ from simopt_envs.gap.hypothesis import Candidate
 from simopt_envs.gap.localise import localise
 from simopt_envs.gap.motion import motion_of
 from simopt_envs.gap.plain import Plain, plain_parameters
-from simopt_envs.gap.recordings import read_windows, whole_recordings
+from simopt_envs.gap.recordings import read_windows, whole_recordings, without_wild_starts
 from simopt_envs.gap.result import Gap, judge, named_effects, repair
 from simopt_envs.gap.search import Explanation, Progress, Search
 from simopt_envs.gap.separate import separate
@@ -80,6 +80,7 @@ def find_gap(
     seen = tuple(c for effect in effects for c in _places(effect, start.model) if _shows(c, start.model, data.fitted))
     whole = whole_recordings(start.model, data, keyframe)
     with _silent_warnings():
+        data = without_wild_starts(start, data, motion)
         explanation = Search(start, data, motion, seen, progress, engine, directory, whole).run()
         return _gap(given, explanation, data, keyframe, began)
 

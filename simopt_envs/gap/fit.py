@@ -151,20 +151,21 @@ class Misfit:
         starts = start_sensitivity(self.hypothesis.model, self._simulate, self.hypothesis.xi(u[None]))
         return Noise.of(scale, np.where(self._counted, np.nan_to_num(starts), 0.0))
 
-    def of_starts(self, u: Array, scale: Array) -> tuple[float, float]:
-        """What uncertain starts make of windows at u (d,), mean squares in units of a noise (c,).
+    def made_by_starts(self, u: Array, scale: Array) -> tuple[Array, Array]:
+        """What uncertain starts make of each window at u (d,), mean squares in units of a noise (c,).
 
         Returns:
-            What they make of the second half of the median window, and what in all windows is not linear in them,
-            and so not in the noise; infinite where a simulation ran away.
+            (w,) of the second halves, and (w,) of what is not linear in the starts, and so not in the noise; infinite
+            where a simulation ran away.
         """
         given = self.hypothesis.model, self._simulate, self.hypothesis.xi(u[None])
         made, bent = (
             np.where(self._counted, np.sum((changes / scale) ** 2, axis=0), 0.0)
             for changes in (start_sensitivity(*given), start_curvature(*given))
         )
-        late = np.median(np.mean(made[:, made.shape[1] // 2 :], axis=(1, 2)))
-        return float(np.nan_to_num(late, nan=np.inf)), float(np.nan_to_num(np.mean(bent), nan=np.inf))
+        of_window = (np.mean(part, axis=(1, 2)) for part in (made[:, made.shape[1] // 2 :], bent))
+        late, not_linear = (np.nan_to_num(part, nan=np.inf) for part in of_window)
+        return late, not_linear
 
     def noise_floor(self, u: Array) -> Array:
         """Standard deviation of the part of the errors at u (d,) that one sample does not share with the next, (c,).

@@ -8,11 +8,15 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from simopt_envs.gap.thresholds import LONG_WINDOW, WINDOW
+from simopt_envs.gap.fit import Misfit
+from simopt_envs.gap.hypothesis import Hypothesis
+from simopt_envs.gap.plain import Plain
+from simopt_envs.gap.thresholds import LONG_WINDOW, WILD, WINDOW
 from simopt_envs.gap.trial import Data
 from simopt_envs.measured.audit import audited
 from simopt_envs.measured.recording import Finding, Recording
 from simopt_envs.measured.windows import Windows, cut_windows
+from simopt_envs.physics.effects import Motion
 from simopt_envs.physics.effects.actuator_delay import LONGEST
 
 _GUARD = 0.5  # seconds between what is fitted of a single recording and what is held out
@@ -68,6 +72,29 @@ def read_windows(model: mujoco.MjModel, recordings: Sequence[Recording], keyfram
         tuple(held_out),
         warnings,
     )
+
+
+def without_wild_starts(plain: Plain, data: Data, motion: Motion) -> Data:
+    """Without the windows in which the start decides: those where its error, beyond the linear, makes more than noise.
+
+    A finger that just catches or just slips leaves hundreds of times the noise in the right model too, and one such
+    window would bend all plain parameters. Which these are is told by the model as given, not by what it leaves; where
+    it is more than half of the windows, all stay.
+    """
+    hypothesis = Hypothesis(plain, (), motion)
+    u = hypothesis.neutral()
+    scale = Misfit(hypothesis, data.fitted).noise_floor(u)
+    kept = []
+    for windows in (data.fitted, data.held_out):
+        _, bent = Misfit(hypothesis, windows).made_by_starts(u, scale)
+        rows = np.flatnonzero(bent <= WILD)
+        kept.append(windows if len(rows) < len(windows) / 2 else windows.select(rows))
+    left_out = len(data.fitted) + len(data.held_out) - sum(map(len, kept))
+    if left_out == 0:
+        return data
+    message = f"{left_out} windows are left out, as what they show depends on how exactly they start"
+    warning = Finding.warning("windows", "start", message)
+    return replace(data, fitted=kept[0], held_out=kept[1], warnings=(*data.warnings, warning))
 
 
 def whole_recordings(model: mujoco.MjModel, data: Data, keyframe: str | None = None) -> Data | None:

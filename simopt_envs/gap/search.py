@@ -146,8 +146,8 @@ class Search:
         if base.excess >= LARGE:
             return False
         for windows in (longer.fitted, longer.held_out):
-            made, bent = Misfit(base.hypothesis, windows).of_starts(base.fit.u, base.sensor_noise)
-            if made > FORGOTTEN or bent > BENT:
+            late, bent = Misfit(base.hypothesis, windows).made_by_starts(base.fit.u, base.sensor_noise)
+            if np.median(late) > FORGOTTEN or np.mean(bent) > BENT:
                 return False
         return True
 
