@@ -89,10 +89,11 @@ def without_wild_starts(plain: Plain, data: Data, motion: Motion) -> Data:
         _, bent = Misfit(hypothesis, windows).made_by_starts(u, scale)
         rows = np.flatnonzero(bent <= WILD)
         kept.append(windows if len(rows) < len(windows) / 2 else windows.select(rows))
-    left_out = len(data.fitted) + len(data.held_out) - sum(map(len, kept))
+    total = len(data.fitted) + len(data.held_out)
+    left_out = total - sum(map(len, kept))
     if left_out == 0:
         return data
-    message = f"{left_out} windows are left out, as what they show depends on how exactly they start"
+    message = f"{left_out} of {total} left out, where all depends on how exactly they start"
     warning = Finding.warning("windows", "start", message)
     return replace(data, fitted=kept[0], held_out=kept[1], warnings=(*data.warnings, warning))
 

@@ -164,7 +164,7 @@ def _jumps(name: str, time: Array, values: Array, step: float) -> Iterator[Findi
     rough = float(np.mean(np.abs(moved) > least))
     if rough > ROUGH_SHARE:
         yield Finding.warning(
-            name, "jumps", f"is no motion: {100 * rough:.2g} % of its samples jump; are rows out of order?"
+            name, "jumps", f"is no motion: {100 * rough:.2g} % of its samples jump; noise, or rows out of order?"
         )
     elif jumps.any():
         row = _first(jumps)
