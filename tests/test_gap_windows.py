@@ -123,7 +123,8 @@ def test_a_right_model_stays_in_short_windows_where_a_start_is_not_forgotten(gra
     whole = whole_recordings(plain.model, data)
     search = Search(plain, data, motion_of(plain.model, recordings), (friction,), whole=whole)
     base = search.base()
-    late, bent = Misfit(base.hypothesis, whole.fitted).made_by_starts(base.fit.u, base.sensor_noise)
+    misfit, at = Misfit(base.hypothesis, whole.fitted), (base.fit.u, base.sensor_noise)
+    late, bent = misfit.late_by_starts(*at), misfit.bent_by_starts(*at)
     assert base.excess < 0.25
     assert ((np.median(late) < FORGOTTEN), (np.mean(bent) < BENT)) == (forgotten, linear)
     assert search.run().data.seconds == pytest.approx(0.5)

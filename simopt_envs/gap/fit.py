@@ -6,7 +6,7 @@ of the sensors and the covariance S P₀ Sᵀ that uncertain starts leave in a w
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -151,21 +151,21 @@ class Misfit:
         starts = start_sensitivity(self.hypothesis.model, self._simulate, self.hypothesis.xi(u[None]))
         return Noise.of(scale, np.where(self._counted, np.nan_to_num(starts), 0.0))
 
-    def made_by_starts(self, u: Array, scale: Array) -> tuple[Array, Array]:
-        """What uncertain starts make of each window at u (d,), mean squares in units of a noise (c,).
+    def late_by_starts(self, u: Array, scale: Array) -> Array:
+        """What uncertain starts make of the second half of each window at u (d,), mean squares in a noise (c,), (w,).
 
-        Returns:
-            (w,) of the second halves, and (w,) of what is not linear in the starts, and so not in the noise; infinite
-            where a simulation ran away.
+        Infinite where a simulation ran away.
         """
-        given = self.hypothesis.model, self._simulate, self.hypothesis.xi(u[None])
-        made, bent = (
-            np.where(self._counted, np.sum((changes / scale) ** 2, axis=0), 0.0)
-            for changes in (start_sensitivity(*given), start_curvature(*given))
-        )
-        of_window = (np.mean(part, axis=(1, 2)) for part in (made[:, made.shape[1] // 2 :], bent))
-        late, not_linear = (np.nan_to_num(part, nan=np.inf) for part in of_window)
-        return late, not_linear
+        made = self._by_starts(start_sensitivity, u, scale)
+        return np.nan_to_num(np.mean(made[:, made.shape[1] // 2 :], axis=(1, 2)), nan=np.inf)
+
+    def bent_by_starts(self, u: Array, scale: Array) -> Array:
+        """The same of whole windows, of what is not linear in the starts, and so not in the noise, (w,)."""
+        return np.nan_to_num(np.mean(self._by_starts(start_curvature, u, scale), axis=(1, 2)), nan=np.inf)
+
+    def _by_starts(self, response: Callable[..., Array], u: Array, scale: Array) -> Array:
+        changes = response(self.hypothesis.model, self._simulate, self.hypothesis.xi(u[None]))
+        return np.where(self._counted, np.sum((changes / scale) ** 2, axis=0), 0.0)
 
     def noise_floor(self, u: Array) -> Array:
         """Standard deviation of the part of the errors at u (d,) that one sample does not share with the next, (c,).

@@ -86,8 +86,7 @@ def without_wild_starts(plain: Plain, data: Data, motion: Motion) -> Data:
     scale = Misfit(hypothesis, data.fitted).noise_floor(u)
     kept = []
     for windows in (data.fitted, data.held_out):
-        _, bent = Misfit(hypothesis, windows).made_by_starts(u, scale)
-        rows = np.flatnonzero(bent <= WILD)
+        rows = np.flatnonzero(Misfit(hypothesis, windows).bent_by_starts(u, scale) <= WILD)
         kept.append(windows if len(rows) < len(windows) / 2 else windows.select(rows))
     total = len(data.fitted) + len(data.held_out)
     left_out = total - sum(map(len, kept))

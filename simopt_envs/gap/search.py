@@ -146,8 +146,8 @@ class Search:
         if base.excess >= LARGE:
             return False
         for windows in (longer.fitted, longer.held_out):
-            late, bent = Misfit(base.hypothesis, windows).made_by_starts(base.fit.u, base.sensor_noise)
-            if np.median(late) > FORGOTTEN or np.mean(bent) > BENT:
+            misfit, at = Misfit(base.hypothesis, windows), (base.fit.u, base.sensor_noise)
+            if np.median(misfit.late_by_starts(*at)) > FORGOTTEN or np.mean(misfit.bent_by_starts(*at)) > BENT:
                 return False
         return True
 
