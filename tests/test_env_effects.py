@@ -14,7 +14,7 @@ pytestmark = needs_effects
 DRAWER, SWING_PEG = "SimOpt/Drawer-v0", "SimOpt/SwingPeg-v0"
 ARM = [
     {"effect": "coulomb_friction", "where": "joint:joint4", "parameters": {"frictionloss": {"value": 5.0, "unit": ""}}},
-    {"effect": "actuator_delay", "where": "actuator:joint2", "parameters": {"delay": 0.07}},
+    {"effect": "actuator_delay", "where": "actuator:joint2", "parameters": {"delay": 0.07, "lag_share": 0.4}},
     {"effect": "actuator_gain", "where": "actuator:joint1", "parameters": {"scale": 0.6}},
     {"effect": "payload", "where": "body:link5", "parameters": {"mass": 1.0}},
 ]

@@ -41,7 +41,7 @@ def windows():
         measured=np.stack([moves, np.zeros_like(moves)], axis=-1) + noise,
         commands=np.zeros((WINDOWS, SAMPLES - 1, 0)),
         past_commands=np.zeros((WINDOWS, 1, 0)),
-        starts=States(*(np.zeros((WINDOWS, 2)) for _ in range(4))),
+        starts=States(*(np.zeros((WINDOWS, 2)) for _ in range(5))),
         stride=1,
     )
 

@@ -98,7 +98,7 @@ def record(model: mujoco.MjModel, steps: int = 1500, period: int = 1) -> tuple[R
 def exact_starts(windows: Windows, qpos: np.ndarray, qvel: np.ndarray, period: float = 0.002) -> States:
     rows = np.round(windows.start_time / period).astype(int)
     zero = np.zeros((len(rows), 2))
-    return States(qpos[rows], qvel[rows], zero, zero)
+    return States(qpos[rows], qvel[rows], zero, zero, zero)
 
 
 def centred(qvel: np.ndarray) -> np.ndarray:

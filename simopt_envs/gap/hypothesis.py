@@ -177,6 +177,7 @@ class HypothesisSimulator:
         self._loads = loads(given, windows) if given.nq < hypothesis.model.nq else {}
         self._model, self._period = hypothesis.model, float(windows.offsets[1])
         self._scalar = scalar_joints(hypothesis.model)
+        self._velocity_measured = {channel.object for channel in self.windows.channels if channel.kind == "qvel"}
         self._lead = [i for i, p in enumerate(hypothesis.space) if p.name == INTEGRATION_LEAD]
         self._ahead = [c for c, channel in enumerate(self.windows.channels) if _is_position(hypothesis.model, channel)]
         self._columns = ColumnModel(hypothesis.space, windows.names)
@@ -212,10 +213,17 @@ class HypothesisSimulator:
         """The states to start from, for each ξ, so that sensors show the measured starts."""
         repeated = starts.select(np.tile(np.arange(len(starts)), len(xi)))
         for c, channel in enumerate(self.windows.channels if self._columns else ()):
-            if channel.kind in ("qpos", "qvel") and self._is_scalar(channel):
-                values = getattr(starts, channel.kind)[:, channel.index]
-                rate = starts.qvel[:, self._dof(channel)] if channel.kind == "qpos" else np.zeros(len(starts))
-                getattr(repeated, channel.kind)[:, channel.index] = self._columns.meant(values, rate, c, xi).ravel()
+            if channel.kind not in ("qpos", "qvel") or not self._is_scalar(channel):
+                continue
+            dof = self._dof(channel)
+            velocity, acceleration = starts.qvel[:, dof], starts.qacc[:, dof]
+            if channel.kind == "qpos":
+                position = starts.qpos[:, channel.index]
+                repeated.qpos[:, channel.index] = self._columns.meant(c, xi, position, velocity, acceleration).ravel()
+                if channel.object not in self._velocity_measured:
+                    repeated.qvel[:, dof] = self._columns.meant_rate(c, xi, velocity, acceleration).ravel()
+            else:
+                repeated.qvel[:, dof] = self._columns.meant(c, xi, velocity, acceleration).ravel()
         if self._loads:
             self._deflect(repeated.qpos, xi)
         leads = np.repeat(np.sum(xi[:, self._lead], axis=1), len(starts))

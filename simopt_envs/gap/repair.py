@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from simopt_envs.gap.hypothesis import Hypothesis
-from simopt_envs.physics.columns import CommandModel, acts_on_columns
+from simopt_envs.physics.columns import CommandModel, acts_on_columns, kept_by
 from simopt_envs.physics.effects.actuators import DEADBAND, actuators
 from simopt_envs.physics.effects.effect import object_name
 from simopt_envs.physics.parameters import Array, ParameterSpace
@@ -32,14 +32,23 @@ def repaired(hypothesis: Hypothesis, xi: Array) -> mujoco.MjSpec:
 def _write_delays(spec: mujoco.MjSpec, hypothesis: Hypothesis, xi: Array) -> None:
     """Put the delays of commands into a spec, where they are nearer to one timestep than to none.
 
-    MuJoCo stores a command after it was used, so that its delays are one timestep long at least.
+    MuJoCo stores a command after it was used, so that its delays are one timestep long at least. A lag is the filter of
+    a drive that has none; where it has one, it becomes dead time.
     """
     timestep = float(spec.option.timestep)
     drives = [object_name(place) for place in actuators(hypothesis.plain.model)]
-    for drive, delay in zip(drives, CommandModel(hypothesis.space, drives).delays(xi[None])[0], strict=True):
+    late = CommandModel(hypothesis.space, drives)
+    for drive, total, lag in zip(drives, late.delays(xi[None])[0], late.lags(xi[None])[0], strict=True):
         for part in (drive, drive + DEADBAND):
-            actuator = spec.actuator(part)
-            if actuator is not None and delay > timestep / 2:
+            actuator, delay = spec.actuator(part), total
+            if actuator is None:
+                continue
+            if lag > timestep / 2 and actuator.dyntype == mujoco.mjtDyn.mjDYN_NONE:
+                actuator.dyntype, actuator.actearly = mujoco.mjtDyn.mjDYN_FILTEREXACT, True
+                actuator.dynprm[0] = lag
+                keep = kept_by(lag, timestep)
+                delay -= timestep * keep / (1 - keep)
+            if delay > timestep / 2:
                 actuator.delay += max(float(delay), timestep)
                 actuator.nsample = max(actuator.nsample, int(np.ceil(actuator.delay / timestep)) + 1)
                 actuator.interp = max(actuator.interp, _LINEAR)

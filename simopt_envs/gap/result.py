@@ -34,6 +34,10 @@ class Estimate:
     unit: str
     interval95: tuple[float, float]
 
+    def __str__(self) -> str:
+        unit = "" if self.unit == "1" else f" {self.unit}"
+        return f"{self.value:.3g}{unit} [{self.interval95[0]:.3g}, {self.interval95[1]:.3g}]"
+
 
 @dataclass(frozen=True)
 class Named:
@@ -52,10 +56,7 @@ class Named:
     partners: tuple[Partner, ...]
 
     def __str__(self) -> str:
-        numbers = ", ".join(
-            f"{name} {e.value:.3g} {e.unit} [{e.interval95[0]:.3g}, {e.interval95[1]:.3g}]"
-            for name, e in self.parameters.items()
-        )
+        numbers = ", ".join(f"{name} {estimate}" for name, estimate in self.parameters.items())
         return f"{self.candidate}: {numbers}"
 
 

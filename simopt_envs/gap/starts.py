@@ -20,7 +20,8 @@ def starts_of(model: mujoco.MjModel, starts: States, given: mujoco.MjModel) -> S
     if given.nq == model.nq:
         return starts
     w = len(starts)
-    qpos, qvel = np.tile(reference_qpos(model), (w, 1)), np.zeros((w, model.nv))
+    qpos = np.tile(reference_qpos(model), (w, 1))
+    qvel, qacc = np.zeros((2, w, model.nv))
     errors = [np.full((w, model.nv), _NEW_JOINT_ERROR) for _ in range(2)]
     for j in range(given.njnt):
         new = model.joint(given.joint(j).name)
@@ -30,9 +31,10 @@ def starts_of(model: mujoco.MjModel, starts: States, given: mujoco.MjModel) -> S
         ]
         of_new = slice(new.dofadr[0], new.dofadr[0] + len(old.damping))
         of_old = slice(old.dofadr[0], old.dofadr[0] + len(old.damping))
-        for target, source in zip((qvel, *errors), (starts.qvel, starts.qpos_error, starts.qvel_error), strict=True):
+        sources = starts.qvel, starts.qpos_error, starts.qvel_error, starts.qacc
+        for target, source in zip((qvel, *errors, qacc), sources, strict=True):
             target[:, of_new] = source[:, of_old]
-    return States(qpos, qvel, *errors)
+    return States(qpos, qvel, errors[0], errors[1], qacc)
 
 
 def loads(model: mujoco.MjModel, windows: Windows) -> dict[str, Array]:

@@ -156,14 +156,17 @@ def _initial_fields(model: mujoco.MjModel, windows: Windows, starts: States) -> 
 def settle_actuators(model: mujoco.MjModel, data: mujoco.MjData, past: Array) -> None:
     """Fill activations and delays as the commands before the start (P, nu), P >= 1, left them.
 
-    A filter has settled on the last command, and an integrated setpoint is where the joint is.
+    A filter had settled on the first of these, and an integrated setpoint is where the joint is.
     """
     mujoco.mj_fwdPosition(model, data)
     for i in range(model.nu):
         first = int(model.actuator_actadr[i])
         match mujoco.mjtDyn(model.actuator_dyntype[i]):
             case mujoco.mjtDyn.mjDYN_FILTER | mujoco.mjtDyn.mjDYN_FILTEREXACT:
-                data.act[first] = past[-1, i]
+                lag, delay = float(model.actuator_dynprm[i, 0]), float(model.actuator_delay[i])
+                arrived = past[: max(1, len(past) - round(delay / model.opt.timestep)), i]
+                kept = np.exp(-model.opt.timestep / max(lag, mujoco.mjMINVAL)) ** np.arange(len(arrived) + 1)[::-1]
+                data.act[first] = np.diff(kept) @ arrived + kept[0] * arrived[0]
             case mujoco.mjtDyn.mjDYN_INTEGRATOR:
                 data.act[first] = data.actuator_length[i]
         length = int(model.actuator_history[i, 0]) if model.nhistory else 0

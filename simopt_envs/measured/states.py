@@ -29,19 +29,21 @@ class States:
         qpos: (w, nq).
         qvel: (w, nv).
         qpos_error, qvel_error: their standard errors along each degree of freedom, (w, nv).
+        qacc: accelerations, (w, nv), of hinges and slides whose positions were measured, else 0.
     """
 
     qpos: Array
     qvel: Array
     qpos_error: Array
     qvel_error: Array
+    qacc: Array
 
     def __len__(self) -> int:
         return len(self.qpos)
 
     def select(self, rows: NDArray[np.intp]) -> States:
         """Some of them, in the order given."""
-        return States(self.qpos[rows], self.qvel[rows], self.qpos_error[rows], self.qvel_error[rows])
+        return States(*(values[rows] for values in vars(self).values()))
 
 
 def reference_qpos(model: mujoco.MjModel, keyframe: str | None = None) -> Array:
@@ -84,6 +86,7 @@ def estimate_states(
     rates = np.zeros_like(qpos)
     qpos_error = np.full((len(samples), model.nv), _POSITION_PRIOR)
     qvel_error = np.full((len(samples), model.nv), _VELOCITY_PRIOR)
+    qacc = np.zeros((len(samples), model.nv))
     unseen = np.ones(model.nv, dtype=bool)
     for channel in (c for c in seen if c.kind == "qpos"):
         signal = smoothed[channel.name]
@@ -92,11 +95,13 @@ def estimate_states(
         dofs = _dofs_of(model, channel)
         qpos_error[:, dofs] = signal.value_error[samples, None]
         qvel_error[:, dofs] = signal.velocity_error[samples, None]
+        if model.jnt_type[channel.object] in _SCALAR:
+            qacc[:, dofs] = signal.acceleration[samples, None]
         unseen[dofs] = False
     if np.isnan(qpos).any():
         raise ValueError(f"{recording.name}: a joint position is missing at a sample whose state is wanted")
     qvel = np.array([_tangent(model, q, rate) for q, rate in zip(qpos, rates, strict=True)]).reshape(-1, model.nv)
-    states = States(qpos, qvel, qpos_error, qvel_error)
+    states = States(qpos, qvel, qpos_error, qvel_error, qacc)
     if unseen.any():
         _fit_unseen(model, states, np.flatnonzero(unseen), seen, smoothed, samples)
     for channel in (c for c in seen if c.kind == "qvel" and c not in paired.values()):

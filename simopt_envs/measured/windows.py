@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import mujoco
 import numpy as np
@@ -17,6 +17,7 @@ from simopt_envs.measured.states import States, estimate_states
 from simopt_envs.physics.parameters import ParameterSpace
 
 _NUMBERS_AT_ONCE = 2**25  # a chunk of worlds records at most so many, 256 MB
+_TIME_CONSTANTS = 5.0  # after which a filter has forgotten all but 1 % of a command
 
 
 @dataclass(frozen=True)
@@ -197,7 +198,10 @@ def simulate_windows(
 
 def _longest_history(model: mujoco.MjModel) -> int:
     """Past commands that the start of a window needs, at least the one in force."""
-    return max(1, int(np.max(np.ravel(model.actuator_history[:, 0]), initial=0)) if model.nhistory else 1)
+    filters = np.isin(model.actuator_dyntype, (mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT))
+    slowest = float(np.max(model.actuator_dynprm[filters, 0], initial=0.0))
+    delayed = int(np.max(np.ravel(model.actuator_history[:, 0]), initial=0)) if model.nhistory else 0
+    return max(1, delayed + int(np.ceil(_TIME_CONSTANTS * slowest / model.opt.timestep)))
 
 
 def _commands(
@@ -246,10 +250,7 @@ def _join(parts: list[Windows]) -> Windows:
     def rows(attribute: str) -> NDArray[np.float64]:
         return np.concatenate([getattr(part, attribute) for part in parts])
 
-    states = [
-        np.concatenate([getattr(part.starts, name) for part in parts])
-        for name in ("qpos", "qvel", "qpos_error", "qvel_error")
-    ]
+    states = [np.concatenate([getattr(part.starts, field.name) for part in parts]) for field in fields(States)]
     return Windows(
         channels=first.channels,
         offsets=first.offsets,

@@ -5,7 +5,8 @@ A parameter that writes ``column.bias``, ``column.scale`` or ``column.delay`` of
     shown(t) = scale * true(t - delay) + bias,
 
 and one that writes ``command.delay`` of an actuator acts before it. (MuJoCo's own delays are at least one timestep
-long, as a command is stored after it was used: what is shorter cannot be said in MJCF.)
+long, as a command is stored after it was used: what is shorter cannot be said in MJCF.) Of either delay the share
+``column.lag_share`` or ``command.lag_share`` is that of a first-order lag, and the rest is dead time.
 """
 
 from __future__ import annotations
@@ -14,11 +15,14 @@ from collections.abc import Sequence
 
 import numpy as np
 from scipy.interpolate import CubicSpline
+from scipy.signal import lfilter
 
 from simopt_envs.physics.parameters import Array, Parameter, ParameterSpace
 
 _OUTSIDE = ("column.", "command.", "clock.")
-_NEUTRAL = {"column.bias": 0.0, "column.scale": 1.0, "column.delay": 0.0}
+_NEUTRAL = {"column.bias": 0.0, "column.scale": 1.0, "column.delay": 0.0, "column.lag_share": 0.0}
+# Ages, in time constants, and weights that a first-order lag gives to what was before (Gauss-Laguerre).
+_AGES, _WEIGHTS = np.polynomial.laguerre.laggauss(3)
 
 
 def acts_on_columns(parameter: Parameter) -> bool:
@@ -49,15 +53,34 @@ class ColumnModel:
         """True values (n, w, S, c), sampled at a period [s], -> what the columns show for ξ (n, d)."""
         shown = true.copy()
         for column in {c for _, c, _ in self._places}:
-            bias, scale, delay = (self._of(field, column, xi) for field in _NEUTRAL)
-            late = _shifted(true[..., column], delay, period) if delay.any() else true[..., column]
+            bias, scale, delay, share = (self._of(field, column, xi) for field in _NEUTRAL)
+            late = _late(true[..., column], delay, share * delay, period) if delay.any() else true[..., column]
             shown[..., column] = scale[:, None, None] * late + bias[:, None, None]
         return shown
 
-    def meant(self, shown: Array, rate: Array, column: int, xi: Array) -> Array:
-        """What is true where a column shows values (w,) that change at a rate (w,), for ξ (n, d): (n, w)."""
-        bias, scale, delay = (self._of(field, column, xi)[:, None] for field in _NEUTRAL)
-        return (shown - bias) / scale + delay * rate / scale
+    def meant(self, column: int, xi: Array, shown: Array, rate: Array, acceleration: Array | None = None) -> Array:
+        """What is true where a column shows values that change.
+
+        Args:
+            column: its index.
+            xi: (n, d).
+            shown: values, (w,).
+            rate: their derivative by time, (w,).
+            acceleration: the second one, (w,), where it is known.
+
+        Returns:
+            (n, w).
+        """
+        bias, scale, delay, share = (self._of(field, column, xi)[:, None] for field in _NEUTRAL)
+        late = delay * rate
+        if acceleration is not None:
+            late = late + 0.5 * delay**2 * (1 - share**2) * acceleration
+        return (shown - bias + late) / scale
+
+    def meant_rate(self, column: int, xi: Array, rate: Array, acceleration: Array) -> Array:
+        """The derivative by time (n, w) of what is true where a column's values have these derivatives, (w,)."""
+        _, scale, delay, _ = (self._of(field, column, xi)[:, None] for field in _NEUTRAL)
+        return (rate + delay * acceleration) / scale
 
     def _of(self, field: str, column: int, xi: Array) -> Array:
         """One property of a column for each ξ, (n,)."""
@@ -71,25 +94,32 @@ class CommandModel:
     """When commands arrive, for values of a space.
 
     Args:
-        space: parameters; those that write no ``command.delay`` do nothing here.
+        space: parameters; those that write neither ``command.delay`` nor ``command.lag_share`` do nothing here.
         actuators: names of the commanded actuators, nu of them.
     """
 
     def __init__(self, space: ParameterSpace, actuators: Sequence[str]):
         self._places = [
-            (actuators.index(write.object), i)
+            (write.field, actuators.index(write.object), i)
             for i, parameter in enumerate(space)
             for write in parameter.writes
-            if write.field == "command.delay" and write.object is not None
+            if write.field in ("command.delay", "command.lag_share") and write.object is not None
         ]
         self._count = len(actuators)
 
     def delays(self, xi: Array) -> Array:
-        """Seconds for ξ (n, d) and each actuator, (n, nu)."""
-        delays = np.zeros((len(xi), self._count))
-        for actuator, i in self._places:
-            delays[:, actuator] += xi[:, i]
-        return delays
+        """Seconds for ξ (n, d) and each actuator, (n, nu): dead times and lags together."""
+        return self._of("command.delay", xi)
+
+    def lags(self, xi: Array) -> Array:
+        """Time constants [s] of the lags among the delays, (n, nu)."""
+        return self._of("command.lag_share", xi) * self.delays(xi)
+
+    def _of(self, field: str, xi: Array) -> Array:
+        values = np.zeros((len(xi), self._count))
+        for _, actuator, i in (place for place in self._places if place[0] == field):
+            values[:, actuator] += xi[:, i]
+        return values
 
     def arriving(self, past: Array, commands: Array, xi: Array, timestep: float) -> Array:
         """What arrives in each step, linear between steps.
@@ -103,18 +133,41 @@ class CommandModel:
         Returns:
             (n, w, N, nu).
         """
+        lags = self.lags(xi)
         stream = np.concatenate([past, commands], axis=1)
-        at = past.shape[1] + np.arange(commands.shape[1])
-        steps = np.clip(self.delays(xi) / timestep, 0, past.shape[1] - 1)
+        first = 0 if lags.any() else past.shape[1]  # a lag remembers
+        at = np.arange(first, stream.shape[1])
+        keep = kept_by(lags, timestep)
+        steps = np.clip(self.delays(xi) / timestep - keep / (1 - keep), 0, past.shape[1] - 1)
         whole = np.floor(steps).astype(np.intp)
         out = np.empty((len(xi), *commands.shape))
         for actuator in range(self._count):
-            late = at - whole[:, actuator, None]  # (n, N)
+            late = np.maximum(at - whole[:, actuator, None], 1)  # (n, N)
             part = (steps[:, actuator] - whole[:, actuator])[:, None, None]
             values = stream[:, :, actuator]
             now, before = (np.moveaxis(values[:, index], 1, 0) for index in (late, late - 1))
-            out[..., actuator] = (1 - part) * now + part * before
+            arrived = (1 - part) * now + part * before
+            for one, a in zip(arrived, keep[:, actuator], strict=True):
+                if a:
+                    one[:] = lfilter([1 - a], [1, -a], one, zi=a * one[:, :1])[0]
+            out[..., actuator] = arrived[..., past.shape[1] - first :]
         return out
+
+
+def kept_by(lag: Array, timestep: float) -> Array:
+    """What a first-order lag of some time constants [s] keeps in a step [s] of what was before: exp(-h / lag).
+
+    Commands that are held in each step come out k / (1 - k) steps late, k being what is kept.
+    """
+    return np.exp(-timestep / np.maximum(lag, 1e-3 * timestep))
+
+
+def _late(values: Array, delay: Array, lag: Array, period: float) -> Array:
+    """Values (n, w, S) at each time less the delay (n,) [s], of which so much is a lag (n,) [s]."""
+    if not lag.any():
+        return _shifted(values, delay, period)
+    aged = (_shifted(values, delay + (age - 1) * lag, period) for age in _AGES)
+    return np.sum([weight * each for weight, each in zip(_WEIGHTS, aged, strict=True)], axis=0)
 
 
 def _shifted(values: Array, delay: Array, period: float) -> Array:

@@ -19,9 +19,10 @@ from simopt_envs.physics.parameters import Parameter, Write, unknown_name
 Effects = Sequence[Mapping[str, Any]]
 """Entries of ``"effects"`` in ``gap.json``: ``{"effect": "coulomb_friction", "where": "joint:elbow",
 "parameters": {"frictionloss": 0.3}}``. A parameter is a number or has one as its ``"value"``; what is not named is
-neutral. Other keys are ignored."""
+neutral. Other keys are ignored. The share of a lag in a delay of commands is taken as dead time."""
 
 _KEYS = ("effect", "where", "parameters")
+_LAG = "command.lag_share"  # which the buffer of an actuator cannot hold
 
 
 def add_effects(spec: mujoco.MjSpec, effects: Effects) -> tuple[Parameter, ...]:
@@ -83,6 +84,8 @@ def _parameters(effect: Effect, model: mujoco.MjModel, place: str, values: Mappi
         if name not in (known := [p.name for p in neutral]):
             raise ValueError(unknown_name(f"parameter of {effect.name}", name, known))
     for p in neutral:
+        if any(write.field == _LAG for write in p.writes):
+            continue
         yield replace(
             p,
             name=f"{effect.name}.{object_name(place)}.{p.name}",

@@ -50,7 +50,7 @@ class Backlash(Effect):
         """See :meth:`Effect.probes`."""
         i = dof(model, object_name(place))
         travel = float(motion.high[i] - motion.low[i])
-        return tuple({"play": part * travel} for part in (0.005, 0.02))
+        return tuple({"play": part * travel} for part in (0.0002, 0.001, 0.005, 0.02))
 
     def rest(self, place: str, values: Values, loads: Mapping[str, Array]) -> dict[str, Array]:
         """See :meth:`Effect.rest`."""

@@ -11,10 +11,14 @@ from simopt_envs.physics.parameters import Parameter, Write
 
 
 class SensorDelay(Effect):
-    """What is recorded is late; a servo reads its own encoder without the delay."""
+    """What is recorded is late (``delay``); a servo reads its own encoder without the delay.
+
+    A share of the delay (``lag_share``) is a first-order lag, as of a filter, the rest dead time.
+    """
 
     name = "sensor_delay"
-    law = "y(t) = x(t - T)"
+    law = "y(t) = x(t - (1 - s) T), lagging by s T"
+    shape = ("lag_share",)
     of_reading = True
 
     def places(self, model: mujoco.MjModel) -> tuple[str, ...]:
@@ -23,9 +27,14 @@ class SensorDelay(Effect):
 
     def parameters(self, model: mujoco.MjModel, place: str) -> tuple[Parameter, ...]:
         """See :meth:`Effect.parameters`."""
-        writes = tuple(Write("column.delay", column, operation="add") for column in columns(model, place))
-        return (Parameter("delay", "s", 0.0, 0.0, 0.2, "linear", writes),)
+        seen = columns(model, place)
+        late = tuple(Write("column.delay", column, operation="add") for column in seen)
+        lagging = tuple(Write("column.lag_share", column, operation="add") for column in seen)
+        return (
+            Parameter("delay", "s", 0.0, 0.0, 0.2, "linear", late),
+            Parameter("lag_share", "1", 0.0, 0.0, 1.0, "linear", lagging),
+        )
 
     def probes(self, model: mujoco.MjModel, place: str, motion: Motion) -> tuple[dict[str, float], ...]:
         """See :meth:`Effect.probes`."""
-        return ({"delay": 0.005},)
+        return {"delay": 0.005}, {"delay": 0.005, "lag_share": 1.0}
