@@ -311,7 +311,7 @@ def gaps(args: Args) -> Iterator[str]:
             joint.armature = 0.0
         gap = find_gap(spec, [args.data / folder / name for name in names], mapping=EXAMPLES / f"{folder}.yaml")
         error = f"{gap.errors.refit:.3g} → {gap.errors.after:.3g}"
-        named = "<br>".join(map(str, gap.effects)) or "nothing"
+        named = "<br>".join([*map(str, gap.effects), *gap.remarks]) or "nothing"
         yield f"| {folder} | {gap.verdict} | {named} | {published[folder]} | {error} | {gap.seconds:.0f} |"
 
 

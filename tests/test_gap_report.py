@@ -1,8 +1,10 @@
 """The figures of a gap report, and the page."""
 
+import mujoco
 import numpy as np
 import pytest
 from conftest import needs_effects
+from gap_plant import MODEL
 
 from simopt_envs.gap.confusion import Partner, Separation
 from simopt_envs.gap.describe import Curve
@@ -10,7 +12,7 @@ from simopt_envs.gap.figures import candidates_figure, curve_figure, error_figur
 from simopt_envs.gap.hypothesis import Candidate
 from simopt_envs.gap.localise import Partition, Row, tabulate
 from simopt_envs.gap.report import diff, effects, table, warnings
-from simopt_envs.gap.result import Estimate, Named
+from simopt_envs.gap.result import Estimate, Named, two_directions
 from simopt_envs.measured.channels import Channel
 from simopt_envs.measured.recording import Recording
 from simopt_envs.measured.states import States
@@ -94,6 +96,26 @@ def test_candidates_and_curve(tmp_path):
     axis = curve_figure(curve).axes[0]
     assert axis.get_ylabel() == "missing force on elbow [N m]"
     assert len(axis.lines) == 4 + 1 + 1  # each recording, all together, zero
+
+
+def test_friction_and_a_constant_force_are_told_as_friction_of_two_directions():
+    model = mujoco.MjModel.from_xml_string(MODEL)
+
+    def of(effect, place, **numbers):
+        parameters = {n: Estimate(x, "N m", (x - 0.1, x + 0.1)) for n, x in numbers.items()}
+        return Named(Candidate(EFFECTS[effect], place), parameters, {}, ())
+
+    friction, force = (
+        of("coulomb_friction", "joint:elbow", frictionloss=2.0),
+        of("actuator_bias", "actuator:elbow", force=-0.5),
+    )
+    (told,) = two_directions(model, [friction, force])
+    assert "2.5 N m forwards, 1.5 N m backwards, 1 N m [0.8, 1.2] apart" in told
+    elsewhere, stronger = (
+        of("actuator_bias", "actuator:shoulder", force=-0.5),
+        of("actuator_bias", "actuator:elbow", force=3.0),
+    )
+    assert not [*two_directions(model, [friction, elsewhere]), *two_directions(model, [friction, stronger])]
 
 
 def test_sections_say_it_in_html(tmp_path):

@@ -97,7 +97,7 @@ def verdict(gap: Gap, description: Description | None) -> Section:
     if gap.effects:
         tiles.append(("Repaired", f"{errors.after:.3g}"))
     tiles.append(("Noise alone", f"{errors.noise_floor:.3g}"))
-    notes = [] if description is None else [f"What is left: {description.text}"]
+    notes = [*gap.remarks, *([] if description is None else [f"What is left: {description.text}"])]
     content = {"headline": _HEADLINES[gap.verdict], "sentence": sentence, "tiles": tiles, "notes": notes}
     return Section("", "verdict.html", {"label": _LABELS.get(gap.verdict, "unexplained"), **content})
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -20,6 +21,8 @@ from simopt_envs.gap.search import Explanation
 from simopt_envs.gap.thresholds import EXPLAINED, LEAST_SHARE
 from simopt_envs.gap.trial import Data
 from simopt_envs.measured.recording import Finding
+from simopt_envs.physics.effects import object_name
+from simopt_envs.physics.effects.actuators import driven_joint
 from simopt_envs.physics.parameters import Array
 
 Verdict = Literal["named", "partly", "none", "unexplained"]
@@ -92,6 +95,11 @@ class Gap:
         return self.explanation.data
 
     @property
+    def remarks(self) -> tuple[str, ...]:
+        """What the effects say together."""
+        return tuple(two_directions(self.explanation.null.hypothesis.plain.model, self.effects))
+
+    @property
     def warnings(self) -> tuple[Finding, ...]:
         """Of the recordings' audit."""
         return self.data.warnings
@@ -99,7 +107,7 @@ class Gap:
     def __str__(self) -> str:
         numbers = f"held-out error {self.errors.refit:.3g} -> {self.errors.after:.3g}"
         numbers += f" (model as given {self.errors.before:.3g}, noise floor {self.errors.noise_floor:.3g})"
-        return "\n".join([self.verdict, *(f"  {effect}" for effect in self.effects), f"  {numbers}"])
+        return "\n  ".join([self.verdict, *map(str, self.effects), *self.remarks, numbers])
 
     def to_dict(self) -> dict[str, Any]:
         """As in ``gap.json``."""
@@ -127,6 +135,7 @@ class Gap:
                 }
                 for named in self.effects
             ],
+            "remarks": list(self.remarks),
             "candidates": [
                 {
                     "effect": score.candidate.effect.name,
@@ -232,6 +241,28 @@ def named_effects(explanation: Explanation) -> tuple[Named, ...]:
         )
         for candidate, columns in hypothesis.columns.items()
     )
+
+
+def two_directions(model: mujoco.MjModel, named: Sequence[Named]) -> Iterator[str]:
+    """A sentence for each joint with Coulomb friction whose drive has a constant force.
+
+    Together they are a friction that differs between the directions: no motion tells which of the two it is.
+    """
+    frictions = {n.candidate.place: n for n in named if n.candidate.effect.name == "coulomb_friction"}
+    for force in (n for n in named if n.candidate.effect.name == "actuator_bias"):
+        drive = object_name(force.candidate.place)
+        friction = frictions.get(f"joint:{driven_joint(model, drive)}")
+        if friction is None:
+            continue
+        level, push = friction.parameters["frictionloss"], force.parameters["force"]
+        if abs(push.value) < level.value:  # or it would be no friction one way
+            low, high = sorted(2 * abs(end) for end in push.interval95)
+            yield (
+                f"The constant force of {drive} and the friction at {friction.candidate.place} are the same as a"
+                f" friction that differs between the directions: {level.value - push.value:.3g} {level.unit} forwards,"
+                f" {level.value + push.value:.3g} {level.unit} backwards, {2 * abs(push.value):.3g} {level.unit}"
+                f" [{low:.3g}, {high:.3g}] apart."
+            )
 
 
 def repair(explanation: Explanation, given: mujoco.MjSpec, xi: Array) -> tuple[mujoco.MjSpec, str]:
