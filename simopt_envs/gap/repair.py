@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from simopt_envs.gap.hypothesis import Hypothesis
-from simopt_envs.physics.columns import CommandModel, acts_on_columns, kept_by
+from simopt_envs.physics.columns import CommandModel, acts_on_columns
 from simopt_envs.physics.effects.actuators import DEADBAND, actuators
 from simopt_envs.physics.effects.effect import object_name
 from simopt_envs.physics.parameters import Array, ParameterSpace
@@ -46,8 +46,7 @@ def _write_delays(spec: mujoco.MjSpec, hypothesis: Hypothesis, xi: Array) -> Non
             if lag > timestep / 2 and actuator.dyntype == mujoco.mjtDyn.mjDYN_NONE:
                 actuator.dyntype, actuator.actearly = mujoco.mjtDyn.mjDYN_FILTEREXACT, True
                 actuator.dynprm[0] = lag
-                keep = kept_by(lag, timestep)
-                delay -= timestep * keep / (1 - keep)
+                delay -= timestep / np.expm1(timestep / lag)  # by which the filter delays what is held in each step
             if delay > timestep / 2:
                 actuator.delay += max(float(delay), timestep)
                 actuator.nsample = max(actuator.nsample, int(np.ceil(actuator.delay / timestep)) + 1)

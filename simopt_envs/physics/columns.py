@@ -133,12 +133,11 @@ class CommandModel:
         Returns:
             (n, w, N, nu).
         """
-        lags = self.lags(xi)
+        lags = self.lags(xi) / timestep
         stream = np.concatenate([past, commands], axis=1)
         first = 0 if lags.any() else past.shape[1]  # a lag remembers
         at = np.arange(first, stream.shape[1])
-        keep = kept_by(lags, timestep)
-        steps = np.clip(self.delays(xi) / timestep - keep / (1 - keep), 0, past.shape[1] - 1)
+        steps = np.clip(self.delays(xi) / timestep - lags, 0, past.shape[1] - 1)
         whole = np.floor(steps).astype(np.intp)
         out = np.empty((len(xi), *commands.shape))
         for actuator in range(self._count):
@@ -147,19 +146,18 @@ class CommandModel:
             values = stream[:, :, actuator]
             now, before = (np.moveaxis(values[:, index], 1, 0) for index in (late, late - 1))
             arrived = (1 - part) * now + part * before
-            for one, a in zip(arrived, keep[:, actuator], strict=True):
-                if a:
-                    one[:] = lfilter([1 - a], [1, -a], one, zi=a * one[:, :1])[0]
+            for one, lag in zip(arrived, lags[:, actuator], strict=True):
+                if lag:
+                    one[:] = _lagging(one, lag)
             out[..., actuator] = arrived[..., past.shape[1] - first :]
         return out
 
 
-def kept_by(lag: Array, timestep: float) -> Array:
-    """What a first-order lag of some time constants [s] keeps in a step [s] of what was before: exp(-h / lag).
-
-    Commands that are held in each step come out k / (1 - k) steps late, k being what is kept.
-    """
-    return np.exp(-timestep / np.maximum(lag, 1e-3 * timestep))
+def _lagging(held: Array, lag: float) -> Array:
+    """Means over each step of what a first-order lag (in steps) makes of values that are held, (..., N)."""
+    kept = np.exp(-1 / lag)
+    at_once, later = 1 - lag * (1 - kept), lag * (1 - kept) ** 2
+    return lfilter([at_once, later - kept * at_once], [1, -kept], held, zi=(1 - at_once) * held[..., :1])[0]
 
 
 def _late(values: Array, delay: Array, lag: Array, period: float) -> Array:
