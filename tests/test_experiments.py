@@ -266,6 +266,7 @@ def test_a_part_of_the_results_says_what_is_missing(tmp_path):
     assert "`python -m baselines.experiments iterations --quick`; seeds 0, 1; 3 of 70 cells" in page
     assert "Not run yet: 5cm-1rollouts, " in page
     assert "| 15 cm | 3 | 2 | 0 % → 55 % → 98 % |" in page
+    assert "as seeds differ in how hard they are: 22cm-3rollouts (0)." in page
 
 
 def test_randomization_compares_with_the_best_fixed_one(pages):

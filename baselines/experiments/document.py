@@ -92,6 +92,12 @@ def _made(question: Question, cells: list[Cell], results: Results, store: Store)
         " counted over. The interval of a success that has one seed only is that of its episodes.",
     ]
     if len(finished) < len(cells):
-        conditions = dict.fromkeys(cell.condition for cell in cells if cell.condition not in results)
-        lines.append(f"Not run yet: {', '.join(conditions) or 'some seeds'}.")
+        if conditions := dict.fromkeys(cell.condition for cell in cells if cell.condition not in results):
+            lines.append(f"Not run yet: {', '.join(conditions)}.")
+        if partial := {c: of_seed for c, of_seed in results.items() if len(of_seed) < len(seeds)}:
+            listed = (f"{c} ({', '.join(map(str, sorted(of_seed)))})" for c, of_seed in partial.items())
+            lines.append(
+                f"Of some seeds only, so not to be compared with what has all, as seeds differ in how hard they are:"
+                f" {'; '.join(listed)}."
+            )
     return "\n\n".join(lines)
