@@ -16,7 +16,9 @@ from rich.console import Console
 from baselines.cli import main
 from baselines.commands import inputs
 from baselines.commands.gap import environment, explain
+from baselines.commands.gap_demo import _joined
 from baselines.logged_system import LoggedSystem
+from simopt_envs.adaptation import EnvSimulator
 from simopt_envs.distributions import Gaussian
 from simopt_envs.gap import find_gap
 from simopt_envs.measured import load_recording
@@ -289,3 +291,19 @@ def test_the_search_starts_from_the_distribution_that_leaves_least(tmp_path, mon
         with pytest.raises(InterruptedError):
             explain(DRAWER, distributions, logs, tmp_path / "gap", Console())
         assert searched.pop() == pytest.approx((at_nominal, 0.02))
+
+
+def test_effects_join_xi_with_their_intervals_but_for_what_an_environment_does_not_have():
+    entry = {
+        "effect": "actuator_delay",
+        "where": "actuator:joint2",
+        "parameters": {
+            "delay": {"value": 0.03, "interval95": [0.02, 0.04]},
+            "lag_share": {"value": 0.5, "interval95": [0.1, 0.9]},
+        },
+    }
+    space = EnvSimulator(with_effects(DRAWER, [entry])).parameters
+    joined = _joined(Gaussian.around_nominal(space.subset(["cabinet_x"]), std=[0.02]), space, [entry])
+    assert joined.space.names == ("cabinet_x", "actuator_delay.joint2.delay")
+    assert joined.median[1] == pytest.approx(0.03)
+    assert joined.std[1] == pytest.approx(0.01 / 1.96)

@@ -123,11 +123,12 @@ class GapDemo:
 
 
 def _joined(prior: Gaussian, space: ParameterSpace, effects: list[dict[str, Any]]) -> Gaussian:
-    """p(ξ) with the parameters of the effects, as sure of them as the gap workflow is."""
+    """p(ξ) with the parameters of the effects that the space has, as sure of them as the gap workflow is."""
     ends = {
-        f"{entry['effect']}.{object_name(entry['where'])}.{name}": fitted["interval95"]
+        full_name: fitted["interval95"]
         for entry in effects
         for name, fitted in entry["parameters"].items()
+        if (full_name := f"{entry['effect']}.{object_name(entry['where'])}.{name}") in space
     }
     added = space.subset(list(ends))
     low, high = (added.to_unconstrained(np.clip(end, added.low, added.high)) for end in np.transpose([*ends.values()]))
