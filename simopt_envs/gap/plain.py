@@ -140,12 +140,8 @@ def _numerical_inertia(model: mujoco.MjModel, dof: int) -> float:
 
 
 def _factor(name: str, *writes: Write) -> Parameter:
-    """A parameter that scales places of the model.
-
-    Linear: what motion tells best is sums (of a mass and an armature, say), and in logarithms the valley that a sum
-    leaves to a fit is bent.
-    """
-    return Parameter(name, "1", 1.0, 1 / _WIDEST, _WIDEST, "linear", writes)
+    """A parameter that scales places of the model."""
+    return Parameter(name, "1", 1.0, 1 / _WIDEST, _WIDEST, "log", writes)
 
 
 def _moving_bodies(model: mujoco.MjModel) -> list[str]:
