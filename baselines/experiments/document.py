@@ -97,7 +97,7 @@ def _made(question: Question, cells: list[Cell], results: Results, store: Store)
         if partial := {c: of_seed for c, of_seed in results.items() if len(of_seed) < len(seeds)}:
             listed = (f"{c} ({', '.join(map(str, sorted(of_seed)))})" for c, of_seed in partial.items())
             lines.append(
-                f"Of some seeds only, so not to be compared with what has all, as seeds differ in how hard they are:"
+                "Of some seeds only, so not to be compared with what has all, as seeds differ in how hard they are:"
                 f" {'; '.join(listed)}."
             )
     return "\n\n".join(lines)

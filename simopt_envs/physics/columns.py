@@ -58,7 +58,7 @@ class ColumnModel:
             shown[..., column] = scale[:, None, None] * late + bias[:, None, None]
         return shown
 
-    def meant(self, column: int, xi: Array, shown: Array, rate: Array, acceleration: Array | None = None) -> Array:
+    def meant(self, column: int, xi: Array, shown: Array, rate: Array, acceleration: Array | float = 0.0) -> Array:
         """What is true where a column shows values that change.
 
         Args:
@@ -66,16 +66,13 @@ class ColumnModel:
             xi: (n, d).
             shown: values, (w,).
             rate: their derivative by time, (w,).
-            acceleration: the second one, (w,), where it is known.
+            acceleration: the second one, (w,), or 0 where it is not known.
 
         Returns:
             (n, w).
         """
         bias, scale, delay, share = (self._of(field, column, xi)[:, None] for field in _NEUTRAL)
-        late = delay * rate
-        if acceleration is not None:
-            late = late + 0.5 * delay**2 * (1 - share**2) * acceleration
-        return (shown - bias + late) / scale
+        return (shown - bias + delay * rate + 0.5 * delay**2 * (1 - share**2) * acceleration) / scale
 
     def meant_rate(self, column: int, xi: Array, rate: Array, acceleration: Array) -> Array:
         """The derivative by time (n, w) of what is true where a column's values have these derivatives, (w,)."""
