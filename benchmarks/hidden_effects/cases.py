@@ -18,7 +18,7 @@ from benchmarks.hidden_effects.plants import plants
 
 Kind = Literal["single", "null", "outside", "double"]
 KINDS: tuple[Kind, ...] = ("single", "null", "outside", "double")
-FIRST_SEED = {"dev": 0, "test": 6000}
+FIRST_SEED = {"dev": 0, "test": 7000}
 """Split -> its first seed. Seeds from 1000, 2000, 3000, 4000 and 5000 on were earlier test splits, run before the
 workflow was changed again; so they count as seen."""
 LEVELS = (10.0, 3.0)

@@ -230,7 +230,6 @@ def fit(
             norm=_HalfSquares(),
             xtol=1e-2,
             x_scale="jac",  # damping relative to what the data say of each coordinate
-            mu_min=1e-3,
             mu_max=1e4,
             mu_factor=10.0,
             max_iter=iterations,
