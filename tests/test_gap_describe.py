@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 from conftest import needs_effects
 
-from simopt_envs.gap.describe import Carrier, Residual, Variable, describe, describe_errors
+from simopt_envs.gap.carriers import Carrier, Residual
+from simopt_envs.gap.curves import Variable
+from simopt_envs.gap.describe import describe, describe_errors
 from simopt_envs.gap.fit import Misfit
 from simopt_envs.gap.hypothesis import Hypothesis
 from simopt_envs.gap.motion import motion_of

@@ -7,7 +7,7 @@ from conftest import needs_effects
 from gap_plant import MODEL
 
 from simopt_envs.gap.confusion import Partner, Separation
-from simopt_envs.gap.describe import Curve
+from simopt_envs.gap.curves import Curve
 from simopt_envs.gap.figures import candidates_figure, curve_figure, error_figure, overlay_figure, regime_figure
 from simopt_envs.gap.hypothesis import Candidate
 from simopt_envs.gap.localise import Partition, Row, tabulate

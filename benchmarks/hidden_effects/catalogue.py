@@ -106,7 +106,7 @@ def scales(name: str) -> Scales:
         joint, dof, address = model.joint(j).name, model.jnt_dofadr[j], model.jnt_qposadr[j]
         v = np.abs(qvel[:, dof])
         moving = v[v > 0.05 * v.max()] if v.max() > 0 else v
-        speed[joint] = laws.rms(moving)
+        speed[joint] = float(np.sqrt(np.mean(np.square(moving))))
         low, middle, high = np.percentile(qpos[:, address], [2, 50, 98])
         spread[joint], centre[joint] = float(high - low), float(middle)
         driven = [i for i in range(model.nu) if model.actuator_trnid[i, 0] == j]

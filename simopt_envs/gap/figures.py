@@ -16,7 +16,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import StrMethodFormatter
 
-from simopt_envs.gap.describe import Curve
+from simopt_envs.gap.curves import Curve
 from simopt_envs.gap.localise import EVERYWHERE, Row
 from simopt_envs.measured.windows import Windows
 from simopt_envs.physics.parameters import Array

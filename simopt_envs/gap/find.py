@@ -13,7 +13,8 @@ import numpy as np
 
 from simopt_envs.distributions.gaussian import Gaussian
 from simopt_envs.engine import Engine
-from simopt_envs.gap.describe import Residual, describe
+from simopt_envs.gap.carriers import Residual
+from simopt_envs.gap.describe import describe
 from simopt_envs.gap.error import held_out_errors
 from simopt_envs.gap.fit import Misfit
 from simopt_envs.gap.hypothesis import Candidate
