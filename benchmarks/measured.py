@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import mujoco
 import numpy as np
@@ -37,7 +37,8 @@ SECONDS = 0.5
 KG_M2, QUADRATIC = "kg m^2", "N m s^2/rad^2"
 PUBLISHED_EMPS = {"mass": 95.1089, "viscous": 203.5034, "coulomb": 20.3935, "offset": 3.1648}
 TOLERANCE_EMPS = {"mass": 0.03, "viscous": 0.03, "coulomb": 0.05, "offset": 0.10}
-RULES = ("reps", "cmaes", "least-squares")
+Rule = Literal["reps", "cmaes", "least-squares"]
+RULES: tuple[Rule, ...] = get_args(Rule)
 WINDOWS = (0.1, 0.5, 2.0)  # s, that least squares fits
 
 
@@ -55,7 +56,7 @@ class Args:
         "gaps",
     )
     """Sections to run."""
-    rules: tuple[Literal["reps", "cmaes", "least-squares"], ...] = RULES
+    rules: tuple[Rule, ...] = RULES
     """Update rules for the double pendulum."""
     out: Path = Path("docs/measured_results.md")
     """Where the tables are written, one section after the other; sections that are not run are kept."""
@@ -74,7 +75,7 @@ def adapt(
     model: mujoco.MjModel,
     prior: Gaussian,
     recordings: Sequence[Recording],
-    rule: str = "least-squares",
+    rule: Rule = "least-squares",
     seconds: float | None = SECONDS,
 ) -> Adapted:
     """Adapt by the SimOpt loop, whatever the rule.
@@ -214,7 +215,7 @@ def pendulum(args: Args) -> Iterator[str]:
     friction = {"coulomb_1": 0.093, "coulomb_2": 0.078, "viscous_1": 0.001, "viscous_2": 0.001}
     yield row("published, with friction", prior.space, prior.space.values(friction))
     adapted = {}
-    fits = [(rule, rule, SECONDS) for rule in args.rules]
+    fits: list[tuple[str, Rule, float]] = [(rule, rule, SECONDS) for rule in args.rules]
     if "least-squares" in args.rules:
         fits += [(f"least-squares, windows of {s:g} s", "least-squares", s) for s in WINDOWS if s != SECONDS]
     for label, rule, seconds in fits:
@@ -223,10 +224,10 @@ def pendulum(args: Args) -> Iterator[str]:
         yield row(label, prior.space, adapted[label].distribution.median, *cost)
     yield f"\n| parameter | before | {' | '.join(adapted)} |\n|---|---|{'---|' * len(adapted)}"
     for i, p in enumerate(prior.space):
-        fits = " | ".join(
+        medians = " | ".join(
             f"{a.distribution.median[i]:.4g} ± {100 * a.distribution.std[i]:.0f} %" for a in adapted.values()
         )
-        yield f"| {p.name} [{p.unit}] | {p.nominal:.4g} ± {100 * prior.std[i]:.0f} % | {fits} |"
+        yield f"| {p.name} [{p.unit}] | {p.nominal:.4g} ± {100 * prior.std[i]:.0f} % | {medians} |"
     if "least-squares" in adapted:
         yield "\nWhat these data leave open, by least squares:\n"
         yield from (f"* {line}" for line in untold_combinations(prior, adapted["least-squares"].distribution))

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import tyro
@@ -36,7 +37,8 @@ def main(args: Args) -> None:
     print("| seed | steps | wall s | CPU s | success |\n|---|---|---|---|---|")
     for seed in args.seeds:
         wall, cpu = time.perf_counter(), time.process_time()
-        policy = TorchPPO()(lambda n, s=seed: simulator.make_vector_env(n, p, s), None, np.random.default_rng(seed))
+        worlds_of = partial(simulator.make_vector_env, distribution=p, seed=seed)
+        policy = TorchPPO()(worlds_of, None, np.random.default_rng(seed))
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
         worlds = simulator.make_vector_env(200, p, 1000 + seed)
         observation, _ = worlds.reset(seed=1000 + seed)

@@ -15,6 +15,7 @@ from __future__ import annotations
 import os
 import time
 from dataclasses import dataclass
+from typing import Any, cast
 
 import gymnasium as gym
 import mujoco
@@ -41,7 +42,7 @@ class Args:
 
 def randomized(env_id: str, num_envs: int) -> gym.vector.VectorEnv:
     env = gym.make_vec(env_id, num_envs=num_envs, autoreset_mode="Disabled")
-    space = env.unwrapped.parameters
+    space = cast(Any, env.unwrapped).parameters
     varied = space.subset([p.name for p in space if p.coordinate == "log"])
     return DistributionVectorWrapper(env, Gaussian.around_nominal(varied, 0.1))
 
@@ -50,10 +51,10 @@ def batched_and_raw(env_id: str, num_envs: int) -> tuple[float, float]:
     """MuJoCo steps per CPU-second: of the vector environment, and of mj_step through the same worlds."""
     env = randomized(env_id, num_envs)
     env.reset(seed=0)
-    inner = env.unwrapped
+    inner = cast(Any, env.unwrapped)
     substeps, simulation = inner.task.substeps, inner.simulation
     worlds = [simulation.world(i) for i in range(num_envs)]
-    actions = np.random.default_rng(0).uniform(-1, 1, (STEPS, *env.action_space.shape))
+    actions = np.random.default_rng(0).uniform(-1, 1, (STEPS, *inner.action_space.shape))
     commands = []
     start = time.process_time()
     for action in actions:
@@ -77,19 +78,19 @@ def batched_and_raw(env_id: str, num_envs: int) -> tuple[float, float]:
     return total / batched, total / raw
 
 
-def control_rate(env: object, num_envs: int, action_shape: tuple[int, ...]) -> float:
+def control_rate(env: Any, num_envs: int, action_shape: tuple[int, ...]) -> float:
     """Control steps per second of a vector environment."""
     action = np.random.default_rng(0).uniform(-1, 1, (num_envs, *action_shape)).astype(np.float32)
-    env.reset()  # type: ignore[attr-defined]
+    env.reset()
     start = time.perf_counter()
     for _ in range(STEPS):
-        env.step(action)  # type: ignore[attr-defined]
+        env.step(action)
     return num_envs * STEPS / (time.perf_counter() - start)
 
 
-def best(env: object, num_envs: int, shape: tuple[int, ...], repetitions: int) -> float:
+def best(env: Any, num_envs: int, shape: tuple[int, ...], repetitions: int) -> float:
     rate = max(control_rate(env, num_envs, shape) for _ in range(repetitions))
-    env.close()  # type: ignore[attr-defined]
+    env.close()
     return rate
 
 
@@ -101,7 +102,7 @@ def main(args: Args) -> None:
         batched, raw = np.max(pairs, axis=0)
         print(f"| {num_envs} | {batched:,.0f} | {raw:,.0f} | {np.median([b / r for b, r in pairs]):.2f} |")
 
-    shape = gym.make(args.env_id).action_space.shape
+    shape = cast(gym.spaces.Box, gym.make(args.env_id).action_space).shape
     native = best(randomized_autoreset(args.env_id), 128, shape, args.repetitions)
     rows = [("native vector env", 128, native)]
     for workers in (2, 4, 8):
