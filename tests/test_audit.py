@@ -119,6 +119,22 @@ def test_a_decent_log_is_left_alone():
     assert audited(GOOD, MODEL).warnings == ()
 
 
+def test_a_quick_motion_in_few_samples_is_one_and_noise_is_none():
+    time = np.arange(150) * 0.02  # 50 Hz
+    rng = np.random.default_rng(0)
+    motion = np.sin(2 * np.pi * 1.5 * time) + 1e-3 * rng.standard_normal(150)
+    noise = 1e-3 * rng.standard_normal(150)
+    assert audit(Recording(time, {"qpos/elbow": motion})) == []
+    assert [f.check for f in audit(Recording(time, {"qpos/elbow": noise}))] == ["jumps"]
+
+
+def test_a_command_may_be_held_where_a_measurement_must_not():
+    time = np.arange(150) * 0.02
+    held = np.clip(np.sin(2 * np.pi * time), -0.7, 0.7)
+    assert audit(Recording(time, {"ctrl/elbow": held})) == []
+    assert [f.check for f in audit(Recording(time, {"qpos/elbow": held}))] == ["saturated"]
+
+
 DEFECTS: dict[str, tuple[Callable[[], Recording], str, str, str]] = {
     # what: (log, severity, check, message)
     "no samples": (lambda: with_rows(np.arange(0)), "error", "length", "only 0 samples; at least 20"),

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from simopt_envs.measured import LogMapping, Recording, Source, load_recording, load_recordings
+from simopt_envs.measured import Finding, LogMapping, Recording, Source, load_recording, load_recordings
+from simopt_envs.measured.recording import warnings_of
 from simopt_envs.measured.resample import band_limited, hold
 
 EXAMPLES = Path(__file__).parents[1] / "simopt_envs" / "measured" / "examples"
@@ -345,3 +346,15 @@ def test_the_example_mappings_read_the_public_logs():
     pendulum = load_recording(data / "double_pendulum" / "trajectory_12.csv", EXAMPLES / "double_pendulum.yaml")
     assert set(pendulum.commands) == {"ctrl/shoulder", "ctrl/elbow"}
     assert pendulum.period == pytest.approx(0.00162, rel=0.01)
+
+
+def test_warnings_of_many_recordings_are_told_once():
+    def log(name: str, *missing: str) -> Recording:
+        found = tuple(Finding.warning(channel, "missing", f"{len(name)} are") for channel in missing)
+        return Recording(np.arange(3.0), {}, name, found)
+
+    logs = [log("one"), log("second", "qpos/a", "qpos/b"), log("third", "qpos/a"), log("fourth", "qpos/a")]
+    assert [str(warning) for warning in warnings_of(logs)] == [
+        "warning: qpos/a: 6 are (second; 2 more like it)",
+        "warning: qpos/b: 6 are (second)",
+    ]

@@ -186,6 +186,7 @@ class Adapt:
         from simopt_envs.adaptation import window_trajectories
         from simopt_envs.measured import cut_windows
         from simopt_envs.measured.logs import load_model
+        from simopt_envs.measured.recording import warnings_of
 
         self._refuse("an environment", "the model", target=self.target, vary=self.vary)
         if not self.data or self.parameters is None:
@@ -216,7 +217,7 @@ class Adapt:
             directory=self.out,
             on_event=display.event,
         )
-        warnings = tuple(dict.fromkeys(str(f) for log in [*recordings, *held_out] for f in log.warnings))
+        warnings = tuple(map(str, warnings_of([*recordings, *held_out])))
         details = Details(typed, Path(self.system).name, float(windows.offsets[1]), notes=warnings)
         iterations = min(self.iterations, 1) if is_fit else self.iterations
         last = run_loop(loop, iterations, display, details, resume_with(typed), resume=self.resume)

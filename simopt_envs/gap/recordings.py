@@ -14,7 +14,7 @@ from simopt_envs.gap.plain import Plain
 from simopt_envs.gap.thresholds import LONG_WINDOW, WILD, WINDOW
 from simopt_envs.gap.trial import Data
 from simopt_envs.measured.audit import audited
-from simopt_envs.measured.recording import Finding, Recording
+from simopt_envs.measured.recording import Finding, Recording, warnings_of
 from simopt_envs.measured.windows import Windows, cut_windows
 from simopt_envs.physics.effects import Motion
 from simopt_envs.physics.effects.actuator_delay import LONGEST
@@ -64,7 +64,7 @@ def read_windows(model: mujoco.MjModel, recordings: Sequence[Recording], keyfram
     fitted, held_out, warnings = split(checked)
     shortest = min(recording.duration for recording in [*fitted, *held_out])
     seconds = min(WINDOW, shortest)
-    warnings += tuple(dict.fromkeys(w for recording in checked for w in recording.warnings))
+    warnings += warnings_of(checked)
     return Data(
         cut_windows(model, fitted, seconds, keyframe=keyframe, history=2 * LONGEST),
         cut_windows(model, held_out, seconds, keyframe=keyframe, history=2 * LONGEST),

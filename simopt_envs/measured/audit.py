@@ -27,9 +27,9 @@ CLIPPED_SHARE = 0.002  # ... and at least this share of all
 CLIPPED_STEPS = 10  # of the encoder, covered in the 5 samples before: a smooth turn covers at most 8 (see _arrivals)
 FROZEN_SAMPLES = 50  # consecutive equal positions that are entered at speed: a sensor that hangs ...
 FROZEN_JOLT = 3.0  # ... with this many times the change of speed that the signal shows elsewhere
-JUMP = 10.0  # times what is covered in the intervals around, between two samples ...
+JUMP = 10.0  # times what is covered in the intervals around and in the median one, between two samples ...
 JUMP_SHARE = 0.01  # ... and this share of the range
-ROUGH_SHARE = 0.25  # of samples that move by JUMP_SHARE of the range: a motion sampled well enough shows few
+ROUGH_SHARE = 0.25  # of samples that leap and at once return, as two of three do in noise; a motion turns slowly
 
 
 def audit(recording: Recording, model: mujoco.MjModel | None = None) -> list[Finding]:
@@ -136,7 +136,7 @@ def _values(name: str, time: Array, values: Array) -> Iterator[Finding]:
         return
     # Where values are hardly quantised, a part of their range counts as one step.
     step = max(resolution(good), 1e-4 * float(np.ptp(good)))
-    for extreme in (good.max(), good.min()):
+    for extreme in () if name.startswith("ctrl/") else (good.max(), good.min()):  # commands are held as one likes
         share = float(np.mean(good == extreme))
         arrivals = _arrivals(time, good, good == extreme, CLIPPED_SAMPLES)
         # A motion against a stop arrives at speed now and then; one that is cut off does most times.
@@ -159,12 +159,14 @@ def _jumps(name: str, time: Array, values: Array, step: float) -> Iterator[Findi
     moved, intervals = np.diff(values), np.diff(time)
     padded = np.pad(np.abs(moved), 3, mode="edge")
     around = np.median([padded[k : k + len(moved)] for k in (0, 1, 2, 4, 5, 6)], axis=0)
+    usual = np.maximum(around, np.median(np.abs(moved)))
     least = max(CLIPPED_STEPS * step, JUMP_SHARE * float(np.ptp(values)))
-    jumps = (np.abs(moved) > np.maximum(least, JUMP * around)) & (intervals <= GAP_PERIODS * sample_period(time))
-    rough = float(np.mean(np.abs(moved) > least))
+    jumps = (np.abs(moved) > np.maximum(least, JUMP * usual)) & (intervals <= GAP_PERIODS * sample_period(time))
+    leaps = np.where(np.abs(moved) > least, np.sign(moved), 0.0)
+    rough = float(np.mean(leaps[1:] * leaps[:-1] < 0))
     if rough > ROUGH_SHARE:
         yield Finding.warning(
-            name, "jumps", f"is no motion: {100 * rough:.2g} % of its samples jump; noise, or rows out of order?"
+            name, "jumps", f"is no motion: {100 * rough:.0f} % of its steps turn back; noise, or rows out of order?"
         )
     elif jumps.any():
         row = _first(jumps)

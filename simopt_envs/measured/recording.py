@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -207,3 +207,22 @@ class Recording:
 
     def _rows(self, keep: np.ndarray) -> Recording:
         return replace(self, time=self.time[keep], columns={n: v[keep] for n, v in self.columns.items()})
+
+
+def warnings_of(recordings: Iterable[Recording]) -> tuple[Finding, ...]:
+    """What recordings warn of, each channel and check once: as the first says it, and how many others say the like."""
+    found: dict[tuple[str, str], list[tuple[str, Finding]]] = {}
+    for recording in recordings:
+        firsts: dict[tuple[str, str], Finding] = {}
+        for warning in recording.warnings:
+            firsts.setdefault((warning.channel, warning.check), warning)
+        for key, first in firsts.items():
+            found.setdefault(key, []).append((recording.name, first))
+    return tuple(_placed(*alike) for alike in found.values())
+
+
+def _placed(first: tuple[str, Finding], *others: tuple[str, Finding]) -> Finding:
+    """A finding with where it is from, and how many others are like it."""
+    name, finding = first
+    more = f"; {len(others)} more like it" if others else ""
+    return replace(finding, message=f"{finding.message} ({name}{more})")

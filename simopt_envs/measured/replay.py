@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
-from simopt_envs.measured.recording import Finding, Recording
+from simopt_envs.measured.recording import Finding, Recording, warnings_of
 from simopt_envs.measured.resample import Array
 from simopt_envs.measured.states import States
 from simopt_envs.measured.windows import Windows, WindowSimulator, cut_windows
@@ -122,8 +122,8 @@ def replay(
     simulated = simulator(xi)
     first_xi = None if xi is None else np.atleast_2d(np.asarray(xi, dtype=np.float64))[:1]
     spread = np.sqrt(np.sum(start_sensitivity(model, simulator, first_xi, simulated[0]) ** 2, axis=0))
-    warnings = tuple(dict.fromkeys(w for recording in recordings for w in recording.warnings))
-    return Replay(windows, simulated, spread, warnings + tuple(_unseen(model, windows.starts)))
+    warnings = (*warnings_of(recordings), *_unseen(model, windows.starts))
+    return Replay(windows, simulated, spread, warnings)
 
 
 class Simulator(Protocol):
