@@ -128,6 +128,14 @@ def test_a_quick_motion_in_few_samples_is_one_and_noise_is_none():
     assert [f.check for f in audit(Recording(time, {"qpos/elbow": noise}))] == ["jumps"]
 
 
+def test_noise_does_not_jump_and_a_glitch_in_it_does():
+    time = np.arange(3000) * 0.02
+    noisy = 0.1 * np.sin(0.2 * np.pi * time) + 8e-4 * np.random.default_rng(0).standard_normal(3000)
+    assert audit(Recording(time, {"qpos/elbow": noisy})) == []
+    noisy[1500] += 0.03
+    assert [f.check for f in audit(Recording(time, {"qpos/elbow": noisy}))] == ["jumps"]
+
+
 def test_a_command_may_be_held_where_a_measurement_must_not():
     time = np.arange(150) * 0.02
     held = np.clip(np.sin(2 * np.pi * time), -0.7, 0.7)

@@ -353,8 +353,9 @@ def test_warnings_of_many_recordings_are_told_once():
         found = tuple(Finding.warning(channel, "missing", f"{len(name)} are") for channel in missing)
         return Recording(np.arange(3.0), {}, name, found)
 
-    logs = [log("one"), log("second", "qpos/a", "qpos/b"), log("third", "qpos/a"), log("fourth", "qpos/a")]
+    logs = [log("one"), log("second", "qpos/a", "qpos/b"), log("third", "qpos/a"), log("fourth", "qpos/a", "qpos/a")]
     assert [str(warning) for warning in warnings_of(logs)] == [
         "warning: qpos/a: 6 are (second; 2 more like it)",
         "warning: qpos/b: 6 are (second)",
+        "warning: qpos/a: 6 are (fourth)",
     ]

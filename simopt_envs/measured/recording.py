@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -210,14 +211,14 @@ class Recording:
 
 
 def warnings_of(recordings: Iterable[Recording]) -> tuple[Finding, ...]:
-    """What recordings warn of, each channel and check once: as the first says it, and how many others say the like."""
-    found: dict[tuple[str, str], list[tuple[str, Finding]]] = {}
+    """What recordings warn of; of the same channel and check in several, the first and how many more there are."""
+    found: dict[tuple[str, str, int], list[tuple[str, Finding]]] = {}
     for recording in recordings:
-        firsts: dict[tuple[str, str], Finding] = {}
+        seen: Counter[tuple[str, str]] = Counter()
         for warning in recording.warnings:
-            firsts.setdefault((warning.channel, warning.check), warning)
-        for key, first in firsts.items():
-            found.setdefault(key, []).append((recording.name, first))
+            key = warning.channel, warning.check
+            found.setdefault((*key, seen[key]), []).append((recording.name, warning))
+            seen[key] += 1
     return tuple(_placed(*alike) for alike in found.values())
 
 
