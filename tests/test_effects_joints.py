@@ -10,6 +10,7 @@ import pytest
 
 from simopt_envs.physics import ModelWriter, ParameterSpace
 from simopt_envs.physics.effects import EFFECTS, Motion
+from simopt_envs.physics.effects.actuators import driven_joint
 from simopt_envs.physics.spec_writer import write_spec
 
 Batch = pytest.importorskip("mujoco.batch", reason="effects need MuJoCo >= 3.17").Batch
@@ -59,7 +60,7 @@ CASES: dict[str, tuple[str, dict[str, float], float]] = {
     "joint_coupling": ("joint:shoulder+elbow", {"stiffness": 5.0}, 1e-12),
     "joint_elasticity": ("joint:elbow", {"stiffness": 60.0}, 5e-7),
     "joint_spring": ("joint:elbow", {"stiffness": 6.0, "reference": 0.5}, 1e-12),
-    "load_dependent_friction": ("joint:drive", {"coefficient": 0.15}, 1e-3),
+    "load_dependent_friction": ("joint:drive", {"coefficient": 0.15}, 5e-5),
     "quadratic_drag": ("joint:drive", {"drag": 8.0}, 1e-12),
     "stribeck_friction": ("joint:drive", {"frictionloss": 2.0, "breakaway": 4.0, "velocity": 0.2}, 1e-9),
 }
@@ -313,48 +314,61 @@ LOADED = """
 """
 
 
-@pytest.mark.parametrize("coefficient", [0.05, 0.1])
-def test_load_dependent_friction_is_that_of_the_transmitted_torque(coefficient: float) -> None:
-    """A pendulum that a motor swings, by a torque: what passes the gear carries the link, I dv/dt = T + gravity."""
-    place, rotor = "joint:hinge", 0.02
-    plain = mujoco.MjModel.from_xml_string(LOADED)
-    link = plain.dof_M0[0] - rotor
-    data = mujoco.MjData(plain)
+CARRIAGE = """
+<mujoco>
+  <option timestep="0.002" integrator="implicitfast"/>
+  <worldbody>
+    <body>
+      <joint name="carriage" type="slide" axis="1 0 0" damping="200" armature="25"/>
+      <geom type="box" size="0.1 0.1 0.05" mass="70"/>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor joint="carriage" gear="300"/>
+  </actuator>
+</mujoco>
+"""
 
-    def gravity(q: float) -> float:
-        data.qpos[:], data.qvel[:] = q, 0.0
-        mujoco.mj_fwdPosition(plain, data)
-        mujoco.mj_fwdVelocity(plain, data)
-        return -float(data.qfrc_bias[0])
 
-    def swing(model: mujoco.MjModel) -> np.ndarray:
-        state, out = mujoco.MjData(model), []
+@pytest.mark.parametrize(
+    ("model", "joint", "coefficient", "tolerance"),
+    [
+        (LOADED, "hinge", 0.02, 0.05),
+        (LOADED, "hinge", 0.1, 0.4),  # at 13 rad/s
+        (CARRIAGE, "carriage", 0.003, 0.1),
+        (CARRIAGE, "carriage", 0.1, 0.1),
+    ],
+)
+def test_load_dependent_friction_is_that_of_the_drive(
+    model: str, joint: str, coefficient: float, tolerance: float
+) -> None:
+    """What a motor swings by a force T: I dv/dt = T + gravity - mu |T| sign(v), integrated finely."""
+    plain = mujoco.MjModel.from_xml_string(model)
+    fine = mujoco.MjSpec.from_string(model)
+    fine.option.timestep = TIMESTEP / 20
+    expected = fine.compile()
+
+    def swing(model: mujoco.MjModel, mu: float = 0.0) -> np.ndarray:
+        data, out, substeps = mujoco.MjData(model), [], round(TIMESTEP / model.opt.timestep)
         for i in range(500):
-            state.ctrl[0] = push(i)
-            mujoco.mj_step(model, state)
-            out.append(state.qpos[0])
+            data.ctrl[0] = np.cos(5 * i * TIMESTEP)
+            force = float(data.ctrl[0] * model.actuator_gear[0, 0])
+            for _ in range(substeps):
+                data.qfrc_applied[0] = -mu * abs(force) * np.tanh(data.qvel[0] / 0.003)
+                mujoco.mj_step(model, data)
+            out.append(data.qpos[0])
         return np.array(out)
 
-    def push(i: int) -> float:
-        return 1.0 * np.cos(5 * i * TIMESTEP)
+    effect = swing(expected, coefficient) - swing(expected)
+    braked = with_effect("load_dependent_friction", f"joint:{joint}", {"coefficient": coefficient}, model)
+    found = swing(braked) - swing(plain)
+    assert np.abs(effect).max() > 5e-4
+    assert found == pytest.approx(effect, abs=tolerance * np.abs(effect).max())
 
-    def law(mu: float) -> np.ndarray:
-        q, v, out, fine = 0.0, 0.0, [], TIMESTEP / 10
-        for i in range(5000):
-            weight, torque = gravity(q), 0.0
-            for _ in range(3):  # friction depends on what it changes
-                dv = (push(i // 10) + weight - mu * abs(torque) * np.sign(v)) / (link + rotor)
-                torque = link * dv - weight
-            v += fine * dv
-            q += fine * v
-            out.append(q)
-        return np.array(out[9::10])
 
-    effect = law(coefficient) - law(0.0)
-    found = swing(with_effect("load_dependent_friction", place, {"coefficient": coefficient}, LOADED)) - swing(plain)
-    assert np.abs(effect).max() > 0.02
-    assert found == pytest.approx(effect, abs=0.2 * np.abs(effect).max())  # at 13 rad/s
-    assert found @ effect == pytest.approx(effect @ effect, rel=2 * coefficient)
+def test_a_drive_that_brakes_its_joint_still_counts_as_its_drive() -> None:
+    named = ARM.replace('<position joint="elbow"', '<position name="servo" joint="elbow"')
+    assert driven_joint(with_effect("load_dependent_friction", "joint:elbow", arm=named), "servo") == "elbow"
 
 
 # A joint behind the motor's: the motor is what is read, the link is what moves.

@@ -33,6 +33,9 @@ NEAR = 1.2
 """How far from 5 sigmas a magnitude may be for what is left to be extrapolated."""
 EQUIVALENT = 0.99
 """Effects whose projected directions correlate by this much cannot be told apart."""
+SAME = 0.999
+"""Effects that change the recordings themselves alike by this much are one, as a rotor and a load of a carriage are,
+whatever priors the plain parameters have beside which they act."""
 SIMILAR = 0.9
 """The table lists others from here up."""
 UNSETTLED = 5
@@ -113,6 +116,10 @@ class Observability:
                 break
         return best
 
+    def change(self, law: Law) -> Array:
+        """Whitened change of all recordings that a law makes, no plain parameter moved."""
+        return self._changed((law,), np.zeros(len(self._deviations)))
+
     def _cut(self, rng: np.random.Generator) -> list[Stretch]:
         world, stretches = World(self.plant, (), self._plain), []
         for i in range(self.plant.analysed):
@@ -190,13 +197,15 @@ class Found:
     Attributes:
         magnitude: that was tried.
         sigmas: that it makes.
-        direction: of the change.
+        direction: of the change, with all that plain parameters could undo taken away.
+        change: the whole of it.
         least: the magnitude that makes 5, by this one and others tried.
     """
 
     magnitude: float
     sigmas: float
     direction: Array
+    change: Array
     least: float = np.nan
 
     @property
@@ -223,19 +232,19 @@ def least_detectable(
     magnitude = min(effect.guess(plant, name) if guess is None else guess, limit)
     tried: list[Found] = []
 
-    def direction_of(magnitude: float) -> Array:
+    def shown(magnitude: float) -> tuple[Array, Array]:
         law, _ = effect.build(plant, name, magnitude, same_form, np.random.default_rng(0))
-        return observability.direction(law)
+        return observability.direction(law), observability.change(law)
 
-    trace = direction_of(0.0) if effect.sets_apart else 0.0
+    traces = shown(0.0) if effect.sets_apart else (np.zeros(1), np.zeros(1))
     for _ in range(8):
         try:
-            direction = direction_of(magnitude) - trace
+            direction, change = (of - trace for of, trace in zip(shown(magnitude), traces, strict=True))
         except Diverged:
             limit = magnitude / 2
             magnitude /= 3
             continue
-        tried.append(Found(magnitude, float(np.linalg.norm(direction)), direction))
+        tried.append(Found(magnitude, float(np.linalg.norm(direction)), direction, change))
         following = min(_next_magnitude(tried), limit)
         if abs(tried[-1].off) < np.log(NEAR) or abs(following / magnitude - 1) < 0.01:
             break
@@ -276,8 +285,10 @@ def analyse(plant: Plant, before: dict[str, dict[str, Any]]) -> dict[str, dict[s
                         f" {answer.sigmas:.2f} sigma",
                         flush=True,
                     )
-    units = np.stack([f.direction / np.linalg.norm(f.direction) for f in found.values()])
-    correlation = np.abs(units @ units.T)
+    projected, whole = (
+        _correlation(vectors) for vectors in zip(*((f.direction, f.change) for f in found.values()), strict=True)
+    )
+    correlation = np.where(whole >= SAME, whole, projected)
     keys = list(found)
     result: dict[str, dict[str, Any]] = {}
     for i, (name, answer) in enumerate(found.items()):
@@ -294,6 +305,12 @@ def analyse(plant: Plant, before: dict[str, dict[str, Any]]) -> dict[str, dict[s
             "alike": alike,
         }
     return result
+
+
+def _correlation(vectors: Sequence[Array]) -> Array:
+    """Of each with each, without signs."""
+    units = np.stack([v / np.linalg.norm(v) for v in vectors])
+    return np.asarray(np.abs(units @ units.T))
 
 
 def key(effect: Effect, place: str, same_form: bool) -> str:

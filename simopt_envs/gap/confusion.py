@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from simopt_envs.gap.explanation import Explanation, stage_of
 from simopt_envs.gap.hypothesis import Candidate
-from simopt_envs.gap.search import Explanation, Stage
 from simopt_envs.gap.thresholds import CONFOUNDED, EVIDENCE
 from simopt_envs.measured.recording import Recording
 from simopt_envs.physics.parameters import Array
@@ -61,7 +61,7 @@ class Partner:
 
 def partners(explanation: Explanation, effect: Candidate) -> tuple[Partner, ...]:
     """The confounded partners of an effect that was added, most alike first."""
-    stage = stage_of(explanation, effect)
+    stage = stage_of(explanation.stages, effect)
     direction = {screened.candidate: screened.direction for screened in stage.screened}
     totals = {score.candidate: score.total for score in stage.scores}
     found = []
@@ -73,12 +73,6 @@ def partners(explanation: Explanation, effect: Candidate) -> tuple[Partner, ...]
         if alike > CONFOUNDED or (behind is not None and behind < EVIDENCE):
             found.append(Partner(candidate, alike, behind))
     return tuple(sorted(found, key=lambda partner: -partner.correlation))
-
-
-def stage_of(explanation: Explanation, effect: Candidate) -> Stage:
-    """The stage at whose end an effect was added: the last one without it."""
-    without = [stage for stage in explanation.stages if effect not in stage.base.hypothesis.candidates]
-    return without[-1]
 
 
 def commands_file(effect: Candidate, partner: Candidate) -> str:

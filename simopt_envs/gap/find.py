@@ -16,14 +16,16 @@ from simopt_envs.engine import Engine
 from simopt_envs.gap.carriers import Residual
 from simopt_envs.gap.describe import describe
 from simopt_envs.gap.error import held_out_errors
+from simopt_envs.gap.explanation import Explanation
 from simopt_envs.gap.fit import Misfit
+from simopt_envs.gap.foreseen import unforeseen
 from simopt_envs.gap.hypothesis import Candidate
 from simopt_envs.gap.localise import localise
 from simopt_envs.gap.motion import motion_of
 from simopt_envs.gap.plain import Plain, plain_parameters
 from simopt_envs.gap.recordings import read_windows, whole_recordings, without_wild_starts
 from simopt_envs.gap.result import Gap, judge, named_effects, repair
-from simopt_envs.gap.search import Explanation, Progress, Search
+from simopt_envs.gap.search import Progress, Search
 from simopt_envs.gap.separate import separate
 from simopt_envs.gap.trial import Base, Data
 from simopt_envs.measured.mapping import LogMapping
@@ -100,7 +102,8 @@ def _silent_warnings() -> Iterator[None]:
 def _gap(given: mujoco.MjSpec, explanation: Explanation, short: Data, keyframe: str | None, began: float) -> Gap:
     """What was found; where the model errs, and on what that depends, is told from short windows in any case."""
     null, final = explanation.null, explanation.final
-    verdict = judge(explanation)
+    beyond = unforeseen(final, explanation.data.held_out)
+    verdict = judge(explanation, beyond)
     if verdict == "unexplained":
         final = null
     as_given = null.hypothesis.space.nominal
@@ -114,7 +117,7 @@ def _gap(given: mujoco.MjSpec, explanation: Explanation, short: Data, keyframe: 
     left = describe(final.hypothesis, final.fit.u, residuals)
     named = separate(named_effects(explained), explained, keyframe)
     seconds = time.perf_counter() - began
-    return Gap(verdict, named, errors, rows, left, explained, spec, diff, seconds)
+    return Gap(verdict, named, errors, rows, left, explained, beyond, spec, diff, seconds)
 
 
 def _left_by(base: Base, windows: Windows) -> Residual:

@@ -4,12 +4,32 @@ from __future__ import annotations
 
 import numpy as np
 
+from simopt_envs.adaptation.fitting import Noise
 from simopt_envs.gap.fit import Misfit
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
+from simopt_envs.gap.trial import Screened
+from simopt_envs.measured.windows import Windows
 from simopt_envs.physics.parameters import Array
 
 _SIZES = np.outer([-1.0, 1.0], [1.0, 3.0, 10.0, 30.0, 100.0, 300.0]).ravel()  # probes
 _FINER = np.geomspace([0.4, 0.9], [2.5, 1.1], 9).T  # of the best so far: where things touch, a fit from afar gets stuck
+
+
+def nearest_size(
+    screened: Screened, windows: Windows, noise: Noise, base: Array, rough: Array | None = None
+) -> tuple[float, Array]:
+    """How far a candidate is from some windows at the size that comes nearest, or nearest around a rough one (d,).
+
+    That is -log p, and the coordinates; those of the base (k,) stay.
+    """
+    hypothesis, candidate = screened.hypothesis, screened.candidate
+    misfit = Misfit(hypothesis, windows).with_noise(noise)
+    start = np.concatenate([base, hypothesis.neutral()[len(base) :]])
+    if rough is None:
+        found = of_rough_size(misfit, candidate, start)
+    else:
+        found = of_fine_size(misfit, candidate, start, rough)
+    return float(misfit.losses(found[None])[0]), found
 
 
 def of_some_size(misfit: Misfit, candidate: Candidate, start: Array) -> Array:

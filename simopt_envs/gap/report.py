@@ -89,7 +89,8 @@ def verdict(gap: Gap, description: Description | None) -> Section:
         "named": f"The model lacks {names}. With it, what is left on recordings that no fit saw is noise.",
         "partly": f"The model lacks {names}. That explains {removed:.0%} of the error that noise does not; the rest "
         "has another cause, or the law has another form.",
-        "none": "With its plain parameters refitted, the model predicts the recordings as well as their noise allows.",
+        "none": "With its plain parameters refitted, the model predicts the recordings as well as their noise and "
+        "what the fit leaves uncertain allow.",
         "unexplained": "The model lacks something that is not in the library of effects, or the recordings cannot "
         "show which it is. No effect is named.",
     }[gap.verdict]

@@ -14,10 +14,10 @@ import numpy as np
 from simopt_envs.gap.confusion import Partner, commands_file, partners
 from simopt_envs.gap.describe import Description
 from simopt_envs.gap.error import Errors
+from simopt_envs.gap.explanation import Explanation
 from simopt_envs.gap.hypothesis import Candidate
 from simopt_envs.gap.localise import Row
 from simopt_envs.gap.repair import column_lines, difference, repaired
-from simopt_envs.gap.search import Explanation
 from simopt_envs.gap.thresholds import EXPLAINED, LEAST_SHARE
 from simopt_envs.gap.trial import Data
 from simopt_envs.measured.recording import Finding
@@ -74,6 +74,7 @@ class Gap:
         localisation: where the refitted model and the recordings disagree, largest share first.
         left: what the part that is not explained depends on.
         explanation: the search behind it.
+        unforeseen: what the verdict is on, see :mod:`simopt_envs.gap.foreseen`.
         spec: the repaired model.
         diff: its difference to the model as given.
         seconds: that it took.
@@ -85,6 +86,7 @@ class Gap:
     localisation: tuple[Row, ...]
     left: Description
     explanation: Explanation
+    unforeseen: float
     spec: mujoco.MjSpec
     diff: str
     seconds: float
@@ -152,9 +154,10 @@ class Gap:
                 "after": self.errors.after,
                 "interval95": list(self.errors.interval95),
                 "noise_floor": self.errors.noise_floor,
-                "whitened": {  # mean square in units of the noise of sensors and starts, which alone leaves 1
+                "whitened": {  # mean square in units of the noise of sensors and starts (and ξ), which alone leaves 1
                     "refit": 1.0 + self.explanation.null.excess,
                     "after": 1.0 + self.explanation.final.excess,
+                    "unforeseen": 1.0 + self.unforeseen,
                 },
                 "held_out": [recording.name for recording in self.data.held_out_recordings],
             },
@@ -208,14 +211,20 @@ def _motion(effect: Candidate, partner: Partner) -> dict[str, Any] | None:
     }
 
 
-def judge(explanation: Explanation) -> Verdict:
-    """The verdict on a search, from what is left on recordings that no fit saw."""
-    left, right = explanation.final.excess, EXPLAINED - 1
+def judge(explanation: Explanation, unforeseen: float) -> Verdict:
+    """The verdict on a search, from what is left on recordings that no fit saw.
+
+    Args:
+        explanation: the search.
+        unforeseen: of its final model, see :mod:`simopt_envs.gap.foreseen`.
+    """
+    right = unforeseen < EXPLAINED - 1
     if not explanation.effects:
-        return "none" if left < right else "unexplained"
-    if left < right:
+        return "none" if right else "unexplained"
+    if right:
         return "named"
-    return "partly" if left < (1 - LEAST_SHARE) * explanation.null.excess else "unexplained"
+    enough = explanation.final.excess < (1 - LEAST_SHARE) * explanation.null.excess
+    return "partly" if enough else "unexplained"
 
 
 def named_effects(explanation: Explanation) -> tuple[Named, ...]:

@@ -1,4 +1,4 @@
-"""Which effects are missing: a screen of the whole library, refits of the best, forward selection, elimination."""
+"""Which effects are missing: a screen of the whole library, refits of the best, forward selection, second thoughts."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from pathlib import Path
 import numpy as np
 
 from simopt_envs.adaptation.checkpoint import Result
-from simopt_envs.adaptation.fitting import Noise
 from simopt_envs.engine import Engine, LocalEngine
+from simopt_envs.gap.explanation import Explanation, Stage, ranked, stage_of
 from simopt_envs.gap.fit import DIFFERENCES, Fit, Misfit, fit
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
 from simopt_envs.gap.kept import kept_fits, key_of
-from simopt_envs.gap.large import of_fine_size, of_rough_size, of_some_size
+from simopt_envs.gap.large import nearest_size, of_some_size
 from simopt_envs.gap.plain import SPEAKS_FOR, Plain
-from simopt_envs.gap.selection import Score, chosen, score_of, tolerance_of, worth_of
+from simopt_envs.gap.selection import chosen, score_of, tolerance_of, worth_of
 from simopt_envs.gap.thresholds import BENT, FAR, FORGOTTEN, LARGE, LARGE_REFITTED, MOST_EFFECTS, REFITTED
 from simopt_envs.gap.trial import Base, Data, Screened, Trial
 from simopt_envs.measured.windows import Windows
@@ -35,43 +35,6 @@ _FURTHEST = 20.0  # probes that the screen's step may be long
 _SECONDS_OF_LARGE = 2.0  # of the worst windows, that candidates of several sizes are tried on
 _TRIED_FINELY = 4  # times as many candidates as are fitted at such a size are tried at finer ones
 _BETTER = 2.0  # nats by which a base must become better for its candidates to be fitted anew
-
-
-@dataclass(frozen=True)
-class Stage:
-    """One step of a search.
-
-    Attributes:
-        base: what there was.
-        screened: every candidate, largest expected gain first.
-        scores: those that were fitted, best first.
-    """
-
-    base: Base
-    screened: tuple[Screened, ...]
-    scores: tuple[Score, ...]
-
-
-@dataclass(frozen=True)
-class Explanation:
-    """What a search found.
-
-    Attributes:
-        null: the model as given, its plain parameters refitted.
-        final: with all effects that are missing; the null where there are none.
-        stages: one for each effect that was added, and the one that added none.
-        data: the windows that were fitted.
-    """
-
-    null: Base
-    final: Base
-    stages: tuple[Stage, ...]
-    data: Data
-
-    @property
-    def effects(self) -> tuple[Candidate, ...]:
-        """What is missing."""
-        return self.final.hypothesis.candidates
 
 
 class Search:
@@ -133,7 +96,8 @@ class Search:
                 break
             stages.append(self._polished(self.stage(base)))
             base = stages[-1].base
-        return Explanation(null, self._eliminated(base), tuple(stages), self.data)
+        final = self._revised(base, stages)
+        return Explanation(null, final, tuple(stages), self.data)
 
     @staticmethod
     def _predicts(base: Base, longer: Data) -> bool:
@@ -182,22 +146,23 @@ class Search:
 
     def stage(self, base: Base) -> Stage:
         """Screen all candidates, and fit the best."""
-        open_candidates = [c for c in self.candidates if c not in base.hypothesis.candidates]
-        screened = []
-        for done, candidate in enumerate(open_candidates):
-            self._progress("screen", done, len(open_candidates))
-            screened.append(self.screen(base, candidate))
-        screened.sort(key=lambda s: -s.gain)
+        screened = self._screened(base)
         spoken_for = self._spoken_for(base)
         wanted = [*spoken_for, *self._large(base, screened)]
         promising = screened[:REFITTED] + [s for s in screened[REFITTED:] if s.candidate in wanted]
         everywhere = (_afresh(base),) if base.excess > LARGE else ()
         far = {candidate: (start, *everywhere) for candidate, start in spoken_for.items()}
         trials = self.trials(base, [_Refit(one, far.get(one.candidate, everywhere)) for one in promising])
-        best = min(trials, key=lambda trial: trial.fit.loss + 0.5 * np.sum((trial.held_out / base.tolerance) ** 2))
-        worth = worth_of(best)
-        scores = [score_of(base, s.candidate, t, worth) for s, t in zip(promising, trials, strict=True)]
-        return Stage(base, tuple(screened), tuple(sorted(scores, key=lambda score: -score.total)))
+        return ranked(base, screened, {s.candidate: trial for s, trial in zip(promising, trials, strict=True)})
+
+    def _screened(self, base: Base) -> list[Screened]:
+        """All candidates that the base lacks, largest expected gain first."""
+        open_candidates = [c for c in self.candidates if c not in base.hypothesis.candidates]
+        screened = []
+        for done, candidate in enumerate(open_candidates):
+            self._progress("screen", done, len(open_candidates))
+            screened.append(self.screen(base, candidate))
+        return sorted(screened, key=lambda s: -s.gain)
 
     def _polished(self, stage: Stage) -> Stage:
         """A stage from the base fitted from where candidates led its parameters, if it comes out better there.
@@ -260,9 +225,9 @@ class Search:
             afresh, nearest = _afresh(base), []
             for done, one in enumerate(screened):
                 self._progress("try sizes of", done, len(screened))
-                nearest.append(_of_some_size(one, windows, noise, afresh))
+                nearest.append(nearest_size(one, windows, noise, afresh))
             order = np.argsort([loss for loss, _ in nearest], kind="stable")[: _TRIED_FINELY * LARGE_REFITTED]
-            fine = [_of_some_size(screened[i], windows, noise, afresh, nearest[i][1])[0] for i in order]
+            fine = [nearest_size(screened[i], windows, noise, afresh, nearest[i][1])[0] for i in order]
             self._largest[effects] = [screened[order[i]].candidate for i in np.argsort(fine, kind="stable")]
         return self._largest[effects][:LARGE_REFITTED]
 
@@ -306,23 +271,37 @@ class Search:
                     starts.setdefault(c, base.fit.u.copy())[i] = 0.0
         return starts
 
-    def _eliminated(self, base: Base) -> Base:
-        """Without the effects that the others have made needless, one after another.
+    def _revised(self, base: Base, stages: list[Stage], dropped: frozenset[Candidate] = frozenset()) -> Base:
+        """Without the effects that the others have made needless, and with rivals that do more beside them instead.
 
         With and without are compared in one noise, that of the model with all: what uncertain starts leave depends on
-        the model too.
+        the model too. What was dropped does not come back.
         """
         effects = base.hypothesis.candidates
         for effect in effects if len(effects) > 1 else ():
-            hypothesis = Hypothesis(self.plain, [e for e in effects if e != effect], self.motion)
-            misfit, test = (Misfit(hypothesis, windows) for windows in (self.data.fitted, self.data.held_out))
-            start = base.hypothesis.without(effect, base.fit.u)
-            found = self._fit(misfit.with_noise(base.noise), start, DIFFERENCES[1:])
-            errors = base.tolerance * test.with_noise(base.held_out_noise).errors(found.u[None])[0]
-            without = Base(hypothesis, found, errors, base.noise, base.held_out_noise, base.tolerance)
+            without = self._without(base, effect)
             if not score_of(without, effect, base, worth_of(base)).earned:
-                return self._eliminated(self.base(hypothesis.candidates, found.u))
+                return self._revised(self.base(without.hypothesis.candidates, without.fit.u), stages, dropped)
+            rivals = stage_of(stages, effect).rivals(effect) - dropped - {*effects}
+            if not rivals:
+                continue
+            screened = self._screened(without)
+            refits = [_Refit(s) for s in screened if s.candidate in rivals]
+            trials = {r.screened.candidate: t for r, t in zip(refits, self.trials(without, refits), strict=True)}
+            stages.append(ranked(without, screened, {**trials, effect: base}))
+            best = chosen(stages[0].base, without, stages[-1].scores)
+            if best is not None and best.candidate != effect:
+                return self._revised(self._sharpened(best.trial), stages, dropped | {effect})
         return base
+
+    def _without(self, base: Base, effect: Candidate) -> Base:
+        """A base without one of its effects, in its noise."""
+        hypothesis = Hypothesis(self.plain, [e for e in base.hypothesis.candidates if e != effect], self.motion)
+        misfit, test = (Misfit(hypothesis, windows) for windows in (self.data.fitted, self.data.held_out))
+        start = base.hypothesis.without(effect, base.fit.u)
+        found = self._fit(misfit.with_noise(base.noise), start, DIFFERENCES[1:])
+        errors = base.tolerance * test.with_noise(base.held_out_noise).errors(found.u[None])[0]
+        return Base(hypothesis, found, errors, base.noise, base.held_out_noise, base.tolerance)
 
 
 @dataclass(frozen=True, repr=False)
@@ -357,23 +336,6 @@ def _fitted(refit: _Refit, base: Base, fitted: Windows, held_out: Windows, num_t
     found = min(fits, key=lambda f: f.loss)
     test = Misfit(hypothesis, held_out, num_threads).with_noise(base.held_out_noise)
     return {**vars(found), "held_out": base.tolerance * test.errors(found.u[None])[0]}
-
-
-def _of_some_size(
-    screened: Screened, windows: Windows, noise: Noise, base: Array, rough: Array | None = None
-) -> tuple[float, Array]:
-    """How far a candidate is from some windows at the size that comes nearest, or nearest around a rough one (d,).
-
-    That is -log p, and the coordinates; those of the base (k,) stay.
-    """
-    hypothesis, candidate = screened.hypothesis, screened.candidate
-    misfit = Misfit(hypothesis, windows).with_noise(noise)
-    start = np.concatenate([base, hypothesis.neutral()[len(base) :]])
-    if rough is None:
-        found = of_rough_size(misfit, candidate, start)
-    else:
-        found = of_fine_size(misfit, candidate, start, rough)
-    return float(misfit.losses(found[None])[0]), found
 
 
 def _afresh(base: Base) -> Array:

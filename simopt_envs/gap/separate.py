@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simopt_envs.adaptation.fitting import Noise
-from simopt_envs.gap.confusion import Partner, Separation, stage_of
+from simopt_envs.gap.confusion import Partner, Separation
 from simopt_envs.gap.excitations import excitations
+from simopt_envs.gap.explanation import Explanation, stage_of
 from simopt_envs.gap.fit import Fit, Misfit
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
 from simopt_envs.gap.result import Named
-from simopt_envs.gap.search import Explanation
 from simopt_envs.gap.trial import Base, Data
 from simopt_envs.measured.recording import Recording
 from simopt_envs.measured.windows import Windows, cut_windows
@@ -113,7 +113,7 @@ def _is_near(simulated: Array, data: Data, noise: Array) -> NDArray[np.bool_]:
 
 def _fitted_size(explanation: Explanation, effect: Candidate, partner: Candidate) -> Array:
     """The partner's parameters where it explains the data best in the effect's place, as far as it was fitted, (k,)."""
-    stage = stage_of(explanation, effect)
+    stage = stage_of(explanation.stages, effect)
     screened = next(s for s in stage.screened if s.candidate == partner)
     columns = screened.hypothesis.columns[partner]
     fitted = next((score.trial.fit.u for score in stage.scores if score.candidate == partner), None)

@@ -14,6 +14,8 @@ from simopt_envs.physics.parameters import Array, Parameter
 
 DEADBAND = ".deadband"
 """What the name of the second actuator of a drive with a dead band ends in."""
+BRAKE = ".brake"
+"""What the name of the tendon ends in through which a drive moves a joint, and presses a brake on it."""
 _LINEAR = ("actuator_gainprm", "actuator_biasprm")
 _AFFINE_GAINS = (int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE))
 _AFFINE_BIASES = (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE))
@@ -36,9 +38,12 @@ def affine_drives(model: mujoco.MjModel) -> tuple[str, ...]:
 def driven_joint(model: mujoco.MjModel, actuator: str) -> str | None:
     """The hinge or slide that a drive moves; None where it moves something else, a tendon or a site."""
     drive = model.actuator(actuator)
-    if drive.trntype[0] != int(mujoco.mjtTrn.mjTRN_JOINT):
+    if drive.trntype[0] == int(mujoco.mjtTrn.mjTRN_JOINT):
+        joint = str(model.joint(drive.trnid[0]).name)
+    elif drive.trntype[0] == int(mujoco.mjtTrn.mjTRN_TENDON) and model.tendon(drive.trnid[0]).name.endswith(BRAKE):
+        joint = str(model.tendon(drive.trnid[0]).name).removesuffix(BRAKE)
+    else:
         return None
-    joint = str(model.joint(drive.trnid[0]).name)
     return joint if f"joint:{joint}" in scalar_joints(model) else None
 
 

@@ -1,0 +1,69 @@
+"""What a search found, and the steps by which it did."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from simopt_envs.gap.hypothesis import Candidate
+from simopt_envs.gap.selection import Score, score_of, worth_of
+from simopt_envs.gap.thresholds import EVIDENCE
+from simopt_envs.gap.trial import Base, Data, Screened, Trial
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One step of a search.
+
+    Attributes:
+        base: what there was.
+        screened: every candidate, largest expected gain first.
+        scores: those that were fitted, best first.
+    """
+
+    base: Base
+    screened: tuple[Screened, ...]
+    scores: tuple[Score, ...]
+
+    def rivals(self, effect: Candidate) -> set[Candidate]:
+        """The other candidates that do nearly as much as the one that was taken, or more."""
+        total = {score.candidate: score.total for score in self.scores}
+        return {candidate for candidate in total if candidate != effect and total[effect] - total[candidate] < EVIDENCE}
+
+
+def ranked(base: Base, screened: Sequence[Screened], trials: Mapping[Candidate, Trial]) -> Stage:
+    """A stage from what was screened and fitted: errors count by what the best trial makes of them."""
+    best = min(trials.values(), key=lambda t: t.fit.loss + 0.5 * np.sum((t.held_out / base.tolerance) ** 2))
+    worth = worth_of(best)
+    scores = [score_of(base, candidate, trial, worth) for candidate, trial in trials.items()]
+    return Stage(base, tuple(screened), tuple(sorted(scores, key=lambda score: -score.total)))
+
+
+def stage_of(stages: Sequence[Stage], effect: Candidate) -> Stage:
+    """The stage at whose end an effect was taken: the last one without it."""
+    return [stage for stage in stages if effect not in stage.base.hypothesis.candidates][-1]
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """What a search found.
+
+    Attributes:
+        null: the model as given, its plain parameters refitted.
+        final: with all effects that are missing; the null where there are none.
+        stages: one for each effect that was added, the one that added none, and those that compared an effect with its
+            rivals beside the others.
+        data: the windows that were fitted.
+    """
+
+    null: Base
+    final: Base
+    stages: tuple[Stage, ...]
+    data: Data
+
+    @property
+    def effects(self) -> tuple[Candidate, ...]:
+        """What is missing."""
+        return self.final.hypothesis.candidates

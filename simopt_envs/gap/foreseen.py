@@ -1,0 +1,33 @@
+"""Whether what is left on held-out recordings is more than noise and the uncertainty of what was fitted.
+
+Recordings that no fit saw may go where the fitted ones told little of a parameter. A right model then errs there by
+more than noise: its errors have the covariance I + J P Jᵀ, J their derivative by u and P the posterior covariance of u.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from simopt_envs.gap.fit import Misfit
+from simopt_envs.gap.trial import Base
+from simopt_envs.measured.windows import Windows
+
+
+def unforeseen(base: Base, held_out: Windows) -> float:
+    """Mean square of the held-out errors in units of the predictive distribution, above 1, to first order.
+
+    Where errors are counted in more than the sensors' noise, it is the base's excess: no parameter could have been
+    foreseen to be so far off.
+
+    Args:
+        base: fitted.
+        held_out: the windows that its held-out errors are of.
+    """
+    if np.any(base.tolerance > 1):
+        return base.excess
+    u = base.fit.u
+    jacobian = Misfit(base.hypothesis, held_out).with_noise(base.held_out_noise).jacobian(u, list(range(len(u))))
+    slope = jacobian.T @ base.held_out.ravel()
+    information = base.fit.rows.T @ base.fit.rows + jacobian.T @ jacobian
+    foreseen = float(slope @ np.linalg.solve(information, slope))  # r'r - r'(I + J P J')⁻¹ r, by Woodbury's identity
+    return base.excess - foreseen / base.held_out.size

@@ -1,0 +1,38 @@
+"""Second thoughts: an effect that was taken while others were missing is held against its rivals beside them."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+from conftest import needs_effects
+from gap_plant import MODEL, record
+
+from simopt_envs.gap.hypothesis import Candidate
+from simopt_envs.gap.motion import motion_of
+from simopt_envs.gap.plain import plain_parameters
+from simopt_envs.gap.recordings import read_windows
+from simopt_envs.gap.search import Search
+from simopt_envs.physics.effects import EFFECTS
+
+pytestmark = needs_effects
+
+SPRING = Candidate(EFFECTS["joint_spring"], "joint:shoulder")
+DRY = Candidate(EFFECTS["coulomb_friction"], "joint:elbow")
+ONE_SIDED = Candidate(EFFECTS["asymmetric_friction"], "joint:elbow")
+
+
+@pytest.mark.parametrize(("difference", "right"), [(0.5, ONE_SIDED), (0.0, DRY)])
+def test_an_effect_gives_way_to_the_rival_that_explains_more_beside_the_others(difference, right):
+    """Friction of the elbow that differs between the directions, or does not, and a spring at the shoulder."""
+    plain = plain_parameters(mujoco.MjSpec.from_string(MODEL))
+    forces = lambda q, v: np.array([-3.0 * q[0], -0.5 * np.tanh(v[1] / 0.01) - difference / 2])  # noqa: E731
+    recordings = record(forces, np.random.default_rng(0))
+    search = Search(
+        plain, read_windows(plain.model, recordings), motion_of(plain.model, recordings), (SPRING, DRY, ONE_SIDED)
+    )
+    stages = [search.stage(search.base())]
+    final = search._revised(search.base((DRY, SPRING)), stages)
+    assert {*final.hypothesis.candidates} == {right, SPRING}
+    assert stages[1].base.hypothesis.candidates == (SPRING,)
+    assert {score.candidate for score in stages[1].scores} == {DRY, ONE_SIDED}
