@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from simopt_envs.gap.fit import Misfit
+from simopt_envs.gap.thresholds import EXPLAINED
 from simopt_envs.gap.trial import Base
 from simopt_envs.measured.windows import Windows
 
@@ -16,14 +17,14 @@ from simopt_envs.measured.windows import Windows
 def unforeseen(base: Base, held_out: Windows) -> float:
     """Mean square of the held-out errors in units of the predictive distribution, above 1, to first order.
 
-    Where errors are counted in more than the sensors' noise, it is the base's excess: no parameter could have been
-    foreseen to be so far off.
+    It is the base's excess where the model does not fit what was fitted either, or where errors are counted in more
+    than the sensors' noise: that no parameter's uncertainty excuses.
 
     Args:
         base: fitted.
         held_out: the windows that its held-out errors are of.
     """
-    if np.any(base.tolerance > 1):
+    if np.any(base.tolerance > 1) or np.mean(base.fit.errors**2) > EXPLAINED:
         return base.excess
     u = base.fit.u
     jacobian = Misfit(base.hypothesis, held_out).with_noise(base.held_out_noise).jacobian(u, list(range(len(u))))
