@@ -90,8 +90,10 @@ class Observability:
         self._furthest = np.array([longest if name == "latency" else 3.0 for name in self._deviations])
         self._slopes = np.stack([self._slope(unit) for unit in np.eye(len(self._deviations))], axis=1)
 
-    def direction(self, law: Law) -> Array:
+    def direction(self, law: Law) -> tuple[Array, Array]:
         """Change of all recordings that a law makes and no plain parameters undo; its norm is in standard deviations.
+
+        With it comes the whole change, no plain parameter moved.
 
         The plain parameters are fitted with the law in (Gauss-Newton, Broyden's update): taken as linear, what is
         left of a load of a few per cent is its own curvature. Their moves, in prior deviations, stand behind the
@@ -101,7 +103,7 @@ class Observability:
             Diverged: where the law makes the simulation run away.
         """
         slopes, x = self._slopes.copy(), np.zeros(len(self._deviations))
-        change = self._changed((law,), x)
+        whole = change = self._changed((law,), x)
         best = np.r_[change, x]
         for _ in range(MOVES):
             normal = slopes.T @ slopes + np.eye(len(x))
@@ -114,11 +116,7 @@ class Observability:
                 best = np.r_[change, x]
             if gained < 0.005 * np.linalg.norm(best):
                 break
-        return best
-
-    def change(self, law: Law) -> Array:
-        """Whitened change of all recordings that a law makes, no plain parameter moved."""
-        return self._changed((law,), np.zeros(len(self._deviations)))
+        return best, whole
 
     def _cut(self, rng: np.random.Generator) -> list[Stretch]:
         world, stretches = World(self.plant, (), self._plain), []
@@ -234,7 +232,7 @@ def least_detectable(
 
     def shown(magnitude: float) -> tuple[Array, Array]:
         law, _ = effect.build(plant, name, magnitude, same_form, np.random.default_rng(0))
-        return observability.direction(law), observability.change(law)
+        return observability.direction(law)
 
     traces = shown(0.0) if effect.sets_apart else (np.zeros(1), np.zeros(1))
     for _ in range(8):

@@ -9,7 +9,7 @@ import numpy as np
 
 from simopt_envs.physics.effects.actuators import BRAKE, actuators, driven_joint
 from simopt_envs.physics.effects.effect import Effect, Motion, object_name
-from simopt_envs.physics.effects.joints import add_fixed_tendon, blank, inertia, outermost_joints
+from simopt_envs.physics.effects.joints import add_fixed_tendon, blank, inertia, scalar_joints
 from simopt_envs.physics.parameters import Array, Parameter, Write
 
 _DRUM = 1.0  # m: its radius; the law does not depend on it
@@ -44,8 +44,8 @@ class LoadDependentFriction(Effect):
         if model.opt.disableflags & _NEEDED:
             return ()
         driven = {driven_joint(model, object_name(place)) for place in actuators(model)}
-        alone = {joint for joint in driven if joint and model.body_jntnum[model.joint(joint).bodyid[0]] == 1}
-        return tuple(place for place in outermost_joints(model) if object_name(place) in alone)
+        joints = ((place, model.joint(object_name(place))) for place in scalar_joints(model))
+        return tuple(place for place, j in joints if j.name in driven and model.body_jntnum[j.bodyid[0]] == 1)
 
     def add(self, spec: mujoco.MjSpec, place: str) -> None:
         """See :meth:`Effect.add`."""
