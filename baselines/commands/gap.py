@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -20,6 +21,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from baselines.commands.engines import EngineOptions
 from baselines.commands.inputs import distribution, existing, require_free
 from baselines.commands.parameter_file import read_parameters
+from baselines.commands.progress import SECONDS_BETWEEN_LINES
 from baselines.commands.recordings import existing_logs
 from simopt_envs.distributions import Gaussian
 from simopt_envs.engine import Engine
@@ -224,12 +226,16 @@ def _moved(spec: mujoco.MjSpec, prior: Gaussian) -> Gaussian:
 
 @contextmanager
 def _shown(console: Console) -> Iterator[Shown]:
-    """A bar for what a search tells of its progress."""
+    """A bar for what a search tells of its progress; lines where that is no terminal."""
     columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("reading", total=None)
+        task, last_line = bar.add_task("reading", total=None), time.monotonic()
 
         def show(what: str, done: int, total: int) -> None:
+            nonlocal last_line
             bar.update(task, description=what, completed=done, total=total)
+            if not console.is_terminal and time.monotonic() - last_line > SECONDS_BETWEEN_LINES:
+                last_line = time.monotonic()
+                console.print(f"looking for what is missing: {what} {done} of {total}")
 
         yield show

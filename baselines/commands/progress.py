@@ -20,7 +20,7 @@ _PHASES = {
     "measure": "comparing simulations with them",
     "update": "moving p(ξ)",
 }
-_SECONDS_BETWEEN_LINES = 10.0
+SECONDS_BETWEEN_LINES = 10.0
 
 
 class TrainingProgress(Protocol):
@@ -127,7 +127,7 @@ class Display:
     def _advance(self, done: int, total: int, result: str, rate: str) -> None:
         if self.console.is_terminal:
             self._bar.update(self._task, total=total, completed=done, description=self._what + result, rate=rate)
-        elif time.monotonic() - self._last_line > _SECONDS_BETWEEN_LINES:
+        elif time.monotonic() - self._last_line > SECONDS_BETWEEN_LINES:
             self._line(f"{self._what}: {done / total:.0%}{result}, {rate}")
             self._last_line = time.monotonic()
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -261,28 +262,30 @@ def _next_magnitude(tried: Sequence[Found]) -> float:
     return tried[-1].magnitude * float(np.clip(np.exp(-tried[-1].off), 1 / 30, 30 if tried[-1].sigmas > 0.1 else 2))
 
 
-def analyse(plant: Plant, before: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+def analyse(plant: Plant, before: dict[str, dict[str, Any]], kept: Path) -> dict[str, dict[str, Any]]:
     """Least detectable magnitudes and look-alikes of everything in a plant, keyed as :func:`key` says.
 
     Args:
         plant: to be analysed.
         before: an earlier answer, to start from.
+        kept: folder of what is finished; an analysis that was stopped goes on from it.
     """
     observability = Observability(plant)
     found: dict[str, Found] = {}
+    kept.mkdir(parents=True, exist_ok=True)
     for effect in (*EFFECTS.values(), *OUTSIDE.values()):
         places = effect.places(plant)
         for place in places if effect.name in EFFECTS else places[-2:]:
             for same_form in effect.forms if effect.forms_differ else effect.forms[-1:]:
-                guess = before.get(key(effect, place, same_form), {}).get("least")
-                answer = least_detectable(observability, effect, place, same_form, guess)
+                name = key(effect, place, same_form)
+                file = kept / f"{name}.npz"
+                if not file.exists():
+                    guess = before.get(name, {}).get("least")
+                    _keep(file, least_detectable(observability, effect, place, same_form, guess))
+                answer = _kept(file)
                 if answer is not None:
-                    found[key(effect, place, same_form)] = answer
-                    print(
-                        f"{plant.name}: {key(effect, place, same_form)}: {answer.magnitude:.4g} makes"
-                        f" {answer.sigmas:.2f} sigma",
-                        flush=True,
-                    )
+                    found[name] = answer
+                    print(f"{plant.name}: {name}: {answer.magnitude:.4g} makes {answer.sigmas:.2f} sigma", flush=True)
     projected, whole = (
         _correlation(vectors) for vectors in zip(*((f.direction, f.change) for f in found.values()), strict=True)
     )
@@ -305,6 +308,21 @@ def analyse(plant: Plant, before: dict[str, dict[str, Any]]) -> dict[str, dict[s
     return result
 
 
+def _keep(file: Path, found: Found | None) -> None:
+    """Writes an answer; one that is nothing as an empty archive. A file is whole or not there."""
+    partial = file.with_suffix(".partial.npz")
+    np.savez(partial, **({} if found is None else vars(found)))
+    partial.replace(file)
+
+
+def _kept(file: Path) -> Found | None:
+    with np.load(file) as archive:
+        if not archive.files:
+            return None
+        magnitude, sigmas, least = (float(archive[name]) for name in ("magnitude", "sigmas", "least"))
+        return Found(magnitude, sigmas, archive["direction"], archive["change"], least)
+
+
 def _correlation(vectors: Sequence[Array]) -> Array:
     """Of each with each, without signs."""
     units = np.stack([v / np.linalg.norm(v) for v in vectors])
@@ -319,12 +337,14 @@ def key(effect: Effect, place: str, same_form: bool) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description="Compute the least detectable magnitudes.")
     parser.add_argument("plants", nargs="*", default=None)
-    names = parser.parse_args().plants or list(plants())
-    for name in names:
+    parser.add_argument("--kept", type=Path, default=Path("out/detectable"), help="what is finished, till the end")
+    arguments = parser.parse_args()
+    for name in arguments.plants or plants():
         table = json.loads(FILE.read_text()) if FILE.exists() else {}
-        answer = analyse(plants()[name], table.get(name, {}))
+        answer = analyse(plants()[name], table.get(name, {}), arguments.kept / name)
         table = json.loads(FILE.read_text()) if FILE.exists() else {}
         FILE.write_text(json.dumps(table | {name: answer}, indent=1) + "\n")
+        shutil.rmtree(arguments.kept / name)
 
 
 if __name__ == "__main__":
