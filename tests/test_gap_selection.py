@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from simopt_envs.gap.hypothesis import Candidate
+from simopt_envs.gap.large import of_several_effects
 from simopt_envs.gap.recordings import split
 from simopt_envs.gap.selection import Score, chosen, tolerance_of
 from simopt_envs.measured import Recording
@@ -37,13 +38,30 @@ def test_of_two_recordings_the_faster_is_fitted():
     assert (fitted.name, held_out.name) == ("4", "1")
 
 
-def _score(parameters: int, excess: float, nats: float) -> Score:
+def _score(parameters: int, excess: float, nats: float, fitted: float | None = None) -> Score:
     trial: Any = SimpleNamespace(
         fit=SimpleNamespace(u=np.zeros(parameters)),
         excess=excess,
         hypothesis=SimpleNamespace(is_itself=lambda candidate, u: True),
     )
-    return Score(Candidate(EFFECTS["coulomb_friction"], "joint:elbow"), trial, nats, nats, 0.0)
+    return Score(
+        Candidate(EFFECTS["coulomb_friction"], "joint:elbow"), trial, nats if fitted is None else fitted, nats, 0.0
+    )
+
+
+@pytest.mark.parametrize(
+    ("fitted", "held_out", "earned"),
+    [
+        (8.0, 14.0, True),
+        (8.0, 8.0, False),  # less than 20 in all
+        (4.0, 19.0, False),  # hardly on the one, and not enough on the other alone
+        (-6.0, 57.0, True),  # what no fit saw may tell alone
+        (57.0, -6.0, False),  # what was fitted may not
+        (-40.0, 57.0, False),
+    ],
+)
+def test_what_no_fit_saw_may_tell_of_an_effect_alone(fitted, held_out, earned):
+    assert _score(1, 0.1, held_out, fitted).earned is earned
 
 
 @pytest.mark.parametrize(
@@ -69,3 +87,19 @@ def test_errors_count_in_what_is_left_only_where_that_is_far_more_than_noise():
     np.testing.assert_array_equal(tolerance_of(right), 1.0)
     astray: Any = SimpleNamespace(held_out=noise * np.array([1.0, 20.0]))
     assert tolerance_of(astray) == pytest.approx([1.0, 20.0], rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("ordered", "fitted"),
+    [
+        ("gggpgfs", "gggpf"),  # one that acts alike at all places leaves room for others
+        ("gpfs", "gpf"),
+        ("gggg", "ggg"),
+    ],
+)
+def test_candidates_of_several_effects_are_fitted_at_the_size_they_need(ordered, fitted):
+    names = {"g": "gravity_compensation", "p": "payload", "f": "coulomb_friction", "s": "joint_spring"}
+    candidates = [Candidate(EFFECTS[names[letter]], f"place:{i}") for i, letter in enumerate(ordered)]
+    chosen_ones = of_several_effects(candidates)
+    assert [c.effect.name for c in chosen_ones] == [names[letter] for letter in fitted]
+    assert chosen_ones == [c for c in candidates if c in chosen_ones]

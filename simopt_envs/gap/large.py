@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from simopt_envs.adaptation.fitting import Noise
 from simopt_envs.gap.fit import Misfit
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
+from simopt_envs.gap.thresholds import LARGE_REFITTED
 from simopt_envs.gap.trial import Screened
 from simopt_envs.measured.windows import Windows
 from simopt_envs.physics.parameters import Array
@@ -51,6 +54,19 @@ def of_fine_size(misfit: Misfit, candidate: Candidate, start: Array, rough: Arra
     for sizes in _FINER:
         rough = misfit.best(_scaled(misfit.hypothesis, candidate, start, rough[None], sizes))
     return rough
+
+
+def of_several_effects(ordered: Sequence[Candidate]) -> list[Candidate]:
+    """The first of some candidates, and the first of further effects: one that acts alike at all places may take all.
+
+    Args:
+        ordered: nearest to the data first.
+    """
+    firsts: dict[str, Candidate] = {}
+    for candidate in ordered:
+        firsts.setdefault(candidate.effect.name, candidate)
+    kept = {*ordered[:LARGE_REFITTED], *list(firsts.values())[:LARGE_REFITTED]}
+    return [candidate for candidate in ordered if candidate in kept]
 
 
 def _scaled(hypothesis: Hypothesis, candidate: Candidate, start: Array, tried: Array, sizes: Array) -> Array:

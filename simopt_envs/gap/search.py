@@ -16,10 +16,10 @@ from simopt_envs.gap.explanation import Explanation, Stage, ranked, stage_of
 from simopt_envs.gap.fit import DIFFERENCES, Fit, Misfit, fit
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
 from simopt_envs.gap.kept import kept_fits, key_of
-from simopt_envs.gap.large import nearest_size, of_some_size
+from simopt_envs.gap.large import nearest_size, of_several_effects, of_some_size
 from simopt_envs.gap.plain import SPEAKS_FOR, Plain
 from simopt_envs.gap.selection import chosen, score_of, tolerance_of, worth_of
-from simopt_envs.gap.thresholds import BENT, FAR, FORGOTTEN, LARGE, LARGE_REFITTED, MOST_EFFECTS, REFITTED
+from simopt_envs.gap.thresholds import BENT, EVIDENCE, FAR, FORGOTTEN, LARGE, LARGE_REFITTED, MOST_EFFECTS, REFITTED
 from simopt_envs.gap.trial import Base, Data, Screened, Trial
 from simopt_envs.measured.windows import Windows
 from simopt_envs.physics.effects import Motion
@@ -31,6 +31,8 @@ Progress = Callable[[str, int, int], None]
 _ITERATIONS = 10
 _STEPS = np.array([1.0, 0.3, 0.1, 0.03])  # shares of the screen's step that a fit may start from
 _WORTH_A_START = 0.2  # share of the best probe's gain at which a fit may start from another one
+_FITTED_COARSELY = 3  # probes, those of the best starts
+_FITTED_IN_FULL = 3  # candidates
 _FURTHEST = 20.0  # probes that the screen's step may be long
 _SECONDS_OF_LARGE = 2.0  # of the worst windows, that candidates of several sizes are tried on
 _TRIED_FINELY = 4  # times as many candidates as are fitted at such a size are tried at finer ones
@@ -153,7 +155,7 @@ class Search:
         everywhere = (_afresh(base),) if base.excess > LARGE else ()
         far = {candidate: (start, *everywhere) for candidate, start in spoken_for.items()}
         trials = self.trials(base, [_Refit(one, far.get(one.candidate, everywhere)) for one in promising])
-        return ranked(base, screened, {s.candidate: trial for s, trial in zip(promising, trials, strict=True)})
+        return ranked(base, screened, self._in_full(base, screened, trials))
 
     def _screened(self, base: Base) -> list[Screened]:
         """All candidates that the base lacks, largest expected gain first."""
@@ -228,12 +230,21 @@ class Search:
                 nearest.append(nearest_size(one, windows, noise, afresh))
             order = np.argsort([loss for loss, _ in nearest], kind="stable")[: _TRIED_FINELY * LARGE_REFITTED]
             fine = [nearest_size(screened[i], windows, noise, afresh, nearest[i][1])[0] for i in order]
-            self._largest[effects] = [screened[order[i]].candidate for i in np.argsort(fine, kind="stable")]
-        return self._largest[effects][:LARGE_REFITTED]
+            ordered = [screened[order[i]].candidate for i in np.argsort(fine, kind="stable")]
+            self._largest[effects] = of_several_effects(ordered)
+        return self._largest[effects]
 
-    def trials(self, base: Base, refits: Sequence[_Refit]) -> list[Trial]:
+    def _in_full(
+        self, base: Base, screened: Sequence[Screened], trials: dict[Candidate, Trial]
+    ) -> dict[Candidate, Trial]:
+        """Trials with the best of them fitted further: the base's derivatives mislead where an effect is large."""
+        best = {s.candidate for s in ranked(base, screened, trials).scores[:_FITTED_IN_FULL] if s.total > EVIDENCE}
+        refits = [_Refit(s, near=trials[s.candidate].fit.u) for s in screened if s.candidate in best]
+        return trials | self.trials(base, refits)
+
+    def trials(self, base: Base, refits: Sequence[_Refit]) -> dict[Candidate, Trial]:
         """Candidates fitted, each together with all that the base has."""
-        keys = [key_of(r.screened.hypothesis, base.fit.u, base.noise.scale, r.screened.starts, *r.far) for r in refits]
+        keys = [key_of(r.screened.hypothesis, base.fit.u, base.noise.scale, *r.starts) for r in refits]
         todo = [i for i, key in enumerate(keys) if not self._kept.has(key)]
         done = itertools.count(len(refits) - len(todo) + 1)
         self._progress("refit", len(refits) - len(todo), len(refits))
@@ -245,11 +256,11 @@ class Search:
 
         shared = base, self.data.fitted, self.data.held_out, self._engine.num_threads
         found = dict(zip(todo, self._engine.map(_fitted, [refits[i] for i in todo], shared, note), strict=True))
-        trials = []
+        trials = {}
         for i, (key, refit) in enumerate(zip(keys, refits, strict=True)):
             arrays = self._kept.phase(key, partial(found.__getitem__, i))
             held_out = arrays.pop("held_out")
-            trials.append(Trial(refit.screened.hypothesis, Fit(**arrays), held_out))
+            trials[refit.screened.candidate] = Trial(refit.screened.hypothesis, Fit(**arrays), held_out)
         return trials
 
     def _fit(self, misfit: Misfit, start: Array, differences: Sequence[float]) -> Fit:
@@ -286,9 +297,8 @@ class Search:
             if not rivals:
                 continue
             screened = self._screened(without)
-            refits = [_Refit(s) for s in screened if s.candidate in rivals]
-            trials = {r.screened.candidate: t for r, t in zip(refits, self.trials(without, refits), strict=True)}
-            stages.append(ranked(without, screened, {**trials, effect: base}))
+            trials = self.trials(without, [_Refit(s) for s in screened if s.candidate in rivals])
+            stages.append(ranked(without, screened, {**self._in_full(without, screened, trials), effect: base}))
             best = chosen(stages[0].base, without, stages[-1].scores)
             if best is not None and best.candidate != effect:
                 return self._revised(self._sharpened(best.trial), stages, dropped | {effect})
@@ -311,10 +321,17 @@ class _Refit:
     Attributes:
         screened: the candidate.
         far: coordinates of the base (d,) from which the candidate is fitted too, at the size that it then needs.
+        near: where an earlier fit ended, (d,), which this one goes on from with all derivatives taken.
     """
 
     screened: Screened
     far: tuple[Array, ...] = ()
+    near: Array | None = None
+
+    @property
+    def starts(self) -> tuple[Array, ...]:
+        """All coordinates that it begins with."""
+        return (self.screened.starts, *self.far) if self.near is None else (self.near,)
 
     def __repr__(self) -> str:
         return str(self.screened.candidate)
@@ -325,17 +342,36 @@ def _fitted(refit: _Refit, base: Base, fitted: Windows, held_out: Windows, num_t
 
     Where the base is far from the data or from its priors, the candidate is fitted at the size that it would need, too:
     with what speaks for it taken away, and with all plain parameters at their priors' means. A base that an effect has
-    bent is the end of a valley that leads away from the right one.
+    bent is the end of a valley that leads away from the right one. A fit that goes on from another takes them all.
     """
     screened, hypothesis = refit.screened, refit.screened.hypothesis
     misfit = Misfit(hypothesis, fitted, num_threads).with_noise(base.noise)
-    fits = [fit(misfit, misfit.best(screened.starts), _ITERATIONS, known=base.fit.jacobian)]
-    for u in refit.far:
-        start = np.concatenate([u, hypothesis.neutral()[len(u) :]])
-        fits.append(fit(misfit, of_some_size(misfit, screened.candidate, start), _ITERATIONS))
-    found = min(fits, key=lambda f: f.loss)
+    if refit.near is None:
+        fits = [_fitted_from(misfit, _of_each_probe(misfit, screened.starts), base.fit.jacobian)]
+        for u in refit.far:
+            start = np.concatenate([u, hypothesis.neutral()[len(u) :]])
+            fits.append(fit(misfit, of_some_size(misfit, screened.candidate, start), _ITERATIONS))
+        found = min(fits, key=lambda f: f.loss)
+    else:
+        found = fit(misfit, refit.near, _ITERATIONS, differences=DIFFERENCES[1:])
     test = Misfit(hypothesis, held_out, num_threads).with_noise(base.held_out_noise)
     return {**vars(found), "held_out": base.tolerance * test.errors(found.u[None])[0]}
+
+
+def _fitted_from(misfit: Misfit, starts: Array, known: Array) -> Fit:
+    """The fit from some starts (k, d); of several that which leads nearest, coarsely, as starts alone tell little."""
+    if len(starts) > 1:
+        coarse = [fit(misfit, start, _ITERATIONS, known, DIFFERENCES[:1]) for start in starts]
+        best = min(coarse, key=lambda f: f.loss)
+        return fit(misfit, best.u, _ITERATIONS, known, DIFFERENCES[1:])
+    return fit(misfit, starts[0], _ITERATIONS, known)
+
+
+def _of_each_probe(misfit: Misfit, starts: Array) -> Array:
+    """The best starts of the probes that have the best ones, (k, d), of those of all probes (n, d)."""
+    losses = misfit.losses(starts).reshape(-1, len(_STEPS))
+    best = np.argmin(losses, axis=1) + len(_STEPS) * np.arange(len(losses))
+    return starts[best[np.argsort(losses.min(axis=1), kind="stable")[:_FITTED_COARSELY]]]
 
 
 def _afresh(base: Base) -> Array:

@@ -57,12 +57,14 @@ class Score:
     def earned(self) -> bool:
         """Whether it may be called missing: it must show in what was fitted, and in recordings that no fit saw.
 
-        Less is asked of an effect that plain parameters can stand in for: all it can show is how far they had to go.
+        The latter may tell alone, as where what was fitted hardly went where the effect acts: there is no price to pay
+        for parameters that they had no part in. Less is asked of an effect that plain parameters can stand in for: all
+        it can show is how far they had to go.
         """
         all_it_can = self.candidate.effect.name in SPEAKS_FOR.values() and self.was_stood_in_for
         least, in_all = (0.0, 0.0) if all_it_can else (EVIDENCE_EACH, EVIDENCE)
         return (
-            min(self.fitted, self.held_out) > least
+            (min(self.fitted, self.held_out) > least or self.held_out > EVIDENCE)
             and self.total > in_all
             and self.trial.hypothesis.is_itself(self.candidate, self.trial.fit.u)
         )
