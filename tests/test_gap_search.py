@@ -1,12 +1,14 @@
-"""Second thoughts: an effect that was taken while others were missing is held against its rivals beside them."""
+"""Where fits of candidates begin, and second thoughts: an effect is held against its rivals beside the others."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import mujoco
 import numpy as np
 import pytest
 from conftest import needs_effects
-from gap_plant import MODEL, record
+from gap_plant import MODEL, Law, record
 
 from simopt_envs.gap.hypothesis import Candidate
 from simopt_envs.gap.motion import motion_of
@@ -19,18 +21,30 @@ pytestmark = needs_effects
 
 SPRING = Candidate(EFFECTS["joint_spring"], "joint:shoulder")
 DRY = Candidate(EFFECTS["coulomb_friction"], "joint:elbow")
+COGGING = Candidate(EFFECTS["cogging"], "joint:elbow")
 ONE_SIDED = Candidate(EFFECTS["asymmetric_friction"], "joint:elbow")
+
+
+def _search(forces: Law, candidates: Sequence[Candidate]) -> Search:
+    plain = plain_parameters(mujoco.MjSpec.from_string(MODEL))
+    recordings = record(forces, np.random.default_rng(0))
+    return Search(plain, read_windows(plain.model, recordings), motion_of(plain.model, recordings), candidates)
+
+
+def test_a_fit_does_not_end_in_the_period_that_its_best_start_is_near():
+    """Cogging with 21 periods per radian: of all probes' starts, the nearest to the data leads to 22."""
+    hidden = lambda q, v: np.array([0.0, -0.5 * np.tanh(v[1] / 0.01) - 0.1 * np.sin(21 * q[1] + 1.0)])  # noqa: E731
+    search = _search(hidden, (DRY, COGGING))
+    (score,) = search.stage(search.base((DRY,))).scores
+    hypothesis, u = score.trial.hypothesis, score.trial.fit.u
+    assert hypothesis.values(COGGING, hypothesis.xi(u[None])[0])["periods"] == pytest.approx(21.0, rel=0.02)
 
 
 @pytest.mark.parametrize(("difference", "right"), [(0.5, ONE_SIDED), (0.0, DRY)])
 def test_an_effect_gives_way_to_the_rival_that_explains_more_beside_the_others(difference, right):
     """Friction of the elbow that differs between the directions, or does not, and a spring at the shoulder."""
-    plain = plain_parameters(mujoco.MjSpec.from_string(MODEL))
-    forces = lambda q, v: np.array([-3.0 * q[0], -0.5 * np.tanh(v[1] / 0.01) - difference / 2])  # noqa: E731
-    recordings = record(forces, np.random.default_rng(0))
-    search = Search(
-        plain, read_windows(plain.model, recordings), motion_of(plain.model, recordings), (SPRING, DRY, ONE_SIDED)
-    )
+    hidden = lambda q, v: np.array([-3.0 * q[0], -0.5 * np.tanh(v[1] / 0.01) - difference / 2])  # noqa: E731
+    search = _search(hidden, (SPRING, DRY, ONE_SIDED))
     stages = [search.stage(search.base())]
     final = search._revised(search.base((DRY, SPRING)), stages)
     assert {*final.hypothesis.candidates} == {right, SPRING}
