@@ -359,12 +359,10 @@ def _fitted(refit: _Refit, base: Base, fitted: Windows, held_out: Windows, num_t
 
 
 def _fitted_from(misfit: Misfit, starts: Array, known: Array) -> Fit:
-    """The fit from some starts (k, d); of several that which leads nearest, coarsely, as starts alone tell little."""
-    if len(starts) > 1:
-        coarse = [fit(misfit, start, _ITERATIONS, known=known, differences=DIFFERENCES[:1]) for start in starts]
-        best = min(coarse, key=lambda f: f.loss)
-        return fit(misfit, best.u, _ITERATIONS, known=known, differences=DIFFERENCES[1:])
-    return fit(misfit, starts[0], _ITERATIONS, known=known)
+    """The fit from that of some starts (k, d) which leads nearest, coarsely, as starts alone tell little."""
+    coarse = [fit(misfit, start, _ITERATIONS, known=known, differences=DIFFERENCES[:1]) for start in starts]
+    best = min(coarse, key=lambda f: f.loss)
+    return fit(misfit, best.u, _ITERATIONS, known=known, differences=DIFFERENCES[1:])
 
 
 def _of_each_probe(misfit: Misfit, starts: Array) -> Array:
