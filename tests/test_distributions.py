@@ -42,6 +42,18 @@ def test_gaussian_density_and_entropy_equal_scipy():
     assert gaussian().log_prob([-1.0, 0.5, 0.0]) == -np.inf
 
 
+def test_gaussian_entropy_is_the_same_to_the_last_digit_wherever_its_arrays_lie():
+    space, rng, held = SPACE.subset(["mass", "damping"]), np.random.default_rng(0), []
+    for _ in range(10):
+        covariance, entropies = np.diag(rng.uniform(0.01, 0.1, 2)), set()
+        for _ in range(1000):
+            held.append(np.empty(rng.integers(1, 8)))  # so that memory is given out and back in another order
+            if rng.random() < 0.5:
+                held.pop(rng.integers(len(held)))
+            entropies.add(Gaussian(space, [0.0, 0.0], covariance).entropy())
+        assert len(entropies) == 1
+
+
 def test_gaussian_kl_equals_the_textbook_formula_and_a_sample_mean():
     p, q = gaussian(), Gaussian(SPACE, [0.0, -0.6, 0.2], np.diag([0.2, 0.05, 0.02]))
     inverse, shift = np.linalg.inv(q.covariance), q.mean - p.mean

@@ -169,7 +169,8 @@ class Gaussian:
 
     @property
     def _half_log_determinant(self) -> float:
-        return float(np.sum(np.log(np.diag(self._cholesky))))
+        # contiguous, as NumPy 1 rounds the logarithms of a strided array by where their memory happens to lie
+        return float(np.sum(np.log(np.diag(self._cholesky).copy())))
 
 
 def _finite(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
