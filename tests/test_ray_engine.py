@@ -265,9 +265,9 @@ def test_candidates_are_fitted_the_same_bit_by_bit(recordings):
 def test_a_candidate_whose_fit_fails_is_named_and_the_others_need_not_be_fitted_again(
     recordings, monkeypatch, tmp_path
 ):
-    from simopt_envs.gap import search
+    from simopt_envs.gap import refit
 
-    fitted, broken, real = [], "actuator_bias at actuator:elbow", search.fit
+    fitted, broken, real = [], "actuator_bias at actuator:elbow", refit.fit
 
     def fit(misfit, start, iterations, **options):
         fitted.append(" and ".join(map(str, misfit.hypothesis.candidates)))
@@ -279,7 +279,7 @@ def test_a_candidate_whose_fit_fails_is_named_and_the_others_need_not_be_fitted_
         fitted.clear()
         return find_gap(mujoco.MjSpec.from_string(MODEL), recordings, effects=FEW, directory=found_in)
 
-    monkeypatch.setattr(search, "fit", fit)
+    monkeypatch.setattr(refit, "fit", fit)
     with pytest.raises(FailedTasksError, match=f"1 of 6 .* {broken}: LinAlgError: singular"):
         find(tmp_path)
     finished = len(fitted) - 1

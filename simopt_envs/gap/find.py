@@ -19,7 +19,7 @@ from simopt_envs.gap.error import held_out_errors
 from simopt_envs.gap.explanation import Explanation
 from simopt_envs.gap.fit import Misfit
 from simopt_envs.gap.foreseen import unforeseen
-from simopt_envs.gap.hypothesis import Candidate
+from simopt_envs.gap.hypothesis import Candidate, Hypothesis
 from simopt_envs.gap.localise import localise
 from simopt_envs.gap.motion import motion_of
 from simopt_envs.gap.plain import Plain, plain_parameters
@@ -32,7 +32,7 @@ from simopt_envs.measured.mapping import LogMapping
 from simopt_envs.measured.readers import load_recordings
 from simopt_envs.measured.recording import Recording
 from simopt_envs.measured.windows import Windows
-from simopt_envs.physics.effects import EFFECTS, Effect, require_mujoco
+from simopt_envs.physics.effects import EFFECTS, Effect, Motion, require_mujoco
 from simopt_envs.physics.effects.readings import columns
 
 _SEED = 0  # of the bootstrap
@@ -83,9 +83,16 @@ def find_gap(
     seen = tuple(c for effect in effects for c in _places(effect, start.model) if _shows(c, start.model, data.fitted))
     whole = whole_recordings(start.model, data, keyframe)
     with _silent_warnings():
-        data = without_wild_starts(start, data, motion)
+        data = _without_wild_starts(start, data, motion)
         explanation = Search(start, data, motion, seen, progress, engine, directory, whole).run()
         return _gap(given, explanation, data, keyframe, began)
+
+
+def _without_wild_starts(plain: Plain, data: Data, motion: Motion) -> Data:
+    """Without those that the model as given tells."""
+    hypothesis = Hypothesis(plain, (), motion)
+    as_given = hypothesis.neutral()
+    return without_wild_starts(hypothesis, as_given, data, Misfit(hypothesis, data.fitted).noise_floor(as_given))
 
 
 @contextmanager

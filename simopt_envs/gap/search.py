@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -16,22 +16,31 @@ from simopt_envs.gap.explanation import Explanation, Stage, ranked, stage_of
 from simopt_envs.gap.fit import DIFFERENCES, Fit, Misfit, fit
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
 from simopt_envs.gap.kept import kept_fits, key_of
-from simopt_envs.gap.large import nearest_size, of_several_effects, of_some_size
+from simopt_envs.gap.large import nearest_size, of_several_effects
 from simopt_envs.gap.plain import SPEAKS_FOR, Plain
+from simopt_envs.gap.recordings import without_wild_starts
+from simopt_envs.gap.refit import ITERATIONS, Refit, fitted
 from simopt_envs.gap.selection import chosen, score_of, tolerance_of, worth_of
-from simopt_envs.gap.thresholds import BENT, EVIDENCE, FAR, FORGOTTEN, LARGE, LARGE_REFITTED, MOST_EFFECTS, REFITTED
+from simopt_envs.gap.thresholds import (
+    BENT,
+    EVIDENCE,
+    FAR,
+    FORGOTTEN,
+    LARGE,
+    LARGE_REFITTED,
+    MOST_EFFECTS,
+    OUTLYING,
+    REFITTED,
+)
 from simopt_envs.gap.trial import Base, Data, Screened, Trial
-from simopt_envs.measured.windows import Windows
 from simopt_envs.physics.effects import Motion
 from simopt_envs.physics.parameters import Array
 
 Progress = Callable[[str, int, int], None]
 """Is told what is being done, and how many of how many are done."""
 
-_ITERATIONS = 10
 _STEPS = np.array([1.0, 0.3, 0.1, 0.03])  # shares of the screen's step that a fit may start from
 _WORTH_A_START = 0.2  # share of the best probe's gain at which a fit may start from another one
-_FITTED_COARSELY = 3  # probes, those of the best starts
 _FITTED_IN_FULL = 3  # candidates
 _FURTHEST = 20.0  # probes that the screen's step may be long
 _SECONDS_OF_LARGE = 2.0  # of the worst windows, that candidates of several sizes are tried on
@@ -87,6 +96,10 @@ class Search:
             self.data = self._whole
             base = self.base(start=base.fit.u)
         stage = self.stage(base)
+        if (data := self._without_wild_starts(stage)) is not self.data:
+            self.data = data
+            self._largest.clear()
+            stage = self.stage(self.base())
         self._tolerance = tolerance_of(min((score.trial for score in stage.scores), key=lambda trial: trial.excess))
         if np.any(self._tolerance > 1):  # only now it is known that nothing comes near the sensors' noise
             stage = self.stage(self.base(start=self._led_to(stage)))
@@ -116,6 +129,25 @@ class Search:
             if np.median(misfit.late_by_starts(*at)) > FORGOTTEN or np.mean(misfit.bent_by_starts(*at)) > BENT:
                 return False
         return True
+
+    def _without_wild_starts(self, stage: Stage) -> Data:
+        """Without those that a candidate tells which explains the median window, where the base is far from that.
+
+        What the candidate leaves of the others then counts little, but a fit to all has been bent by it, so it is
+        fitted anew, from where that bent nothing, until it tells of no more. An effect that acts in few windows alone
+        leaves the base near to the median one, and so leaves all windows where they are.
+        """
+        base, data = stage.base, self.data
+        nearest = min((score.trial for score in stage.scores), key=lambda trial: _of_median_window(trial.fit))
+        if _of_median_window(base.fit) < LARGE * max(_of_median_window(nearest.fit), 1.0):
+            return data
+        hypothesis, u = nearest.hypothesis, nearest.fit.u
+        while (fewer := without_wild_starts(hypothesis, u, data, base.sensor_noise, OUTLYING)) is not data:
+            data = fewer
+            misfit = Misfit(hypothesis, data.fitted)
+            misfit = misfit.with_noise(misfit.noise_at(u, base.sensor_noise))
+            u = fit(misfit, _afresh(nearest), ITERATIONS).u
+        return data
 
     def base(self, effects: Sequence[Candidate] = (), start: Array | None = None) -> Base:
         """The hypothesis of some effects, fitted with all its differences."""
@@ -154,7 +186,7 @@ class Search:
         promising = screened[:REFITTED] + [s for s in screened[REFITTED:] if s.candidate in wanted]
         everywhere = (_afresh(base),) if base.excess > LARGE else ()
         far = {candidate: (start, *everywhere) for candidate, start in spoken_for.items()}
-        trials = self.trials(base, [_Refit(one, far.get(one.candidate, everywhere)) for one in promising])
+        trials = self.trials(base, [Refit(one, far.get(one.candidate, everywhere)) for one in promising])
         return ranked(base, screened, self._in_full(base, screened, trials))
 
     def _screened(self, base: Base) -> list[Screened]:
@@ -209,7 +241,7 @@ class Search:
             found.append(Screened(candidate, hypothesis, direction, gain, starts))
         best = max(found, key=lambda s: s.gain)
         promising = [s.starts for s in found if s.gain >= _WORTH_A_START * best.gain]
-        return replace(best, starts=np.concatenate(promising))
+        return replace(best, starts=np.array(promising))
 
     def _large(self, base: Base, screened: Sequence[Screened]) -> list[Candidate]:
         """The candidates that come nearest to the data at some size, where the base is far from them.
@@ -239,12 +271,12 @@ class Search:
     ) -> dict[Candidate, Trial]:
         """Trials with the best of them fitted further: the base's derivatives mislead where an effect is large."""
         best = {s.candidate for s in ranked(base, screened, trials).scores[:_FITTED_IN_FULL] if s.total > EVIDENCE}
-        refits = [_Refit(s, near=trials[s.candidate].fit.u) for s in screened if s.candidate in best]
+        refits = [Refit(s, near=trials[s.candidate].fit.u) for s in screened if s.candidate in best]
         return trials | self.trials(base, refits)
 
-    def trials(self, base: Base, refits: Sequence[_Refit]) -> dict[Candidate, Trial]:
+    def trials(self, base: Base, refits: Sequence[Refit]) -> dict[Candidate, Trial]:
         """Candidates fitted, each together with all that the base has."""
-        keys = [key_of(r.screened.hypothesis, base.fit.u, base.noise.scale, *r.starts) for r in refits]
+        keys = [self._key(r.screened.hypothesis, base.fit.u, base.noise.scale, *r.starts) for r in refits]
         todo = [i for i, key in enumerate(keys) if not self._kept.has(key)]
         done = itertools.count(len(refits) - len(todo) + 1)
         self._progress("refit", len(refits) - len(todo), len(refits))
@@ -255,7 +287,7 @@ class Search:
             self._progress("refit", next(done), len(refits))
 
         shared = base, self.data.fitted, self.data.held_out, self._engine.num_threads
-        found = dict(zip(todo, self._engine.map(_fitted, [refits[i] for i in todo], shared, note), strict=True))
+        found = dict(zip(todo, self._engine.map(fitted, [refits[i] for i in todo], shared, note), strict=True))
         trials = {}
         for i, (key, refit) in enumerate(zip(keys, refits, strict=True)):
             arrays = self._kept.phase(key, partial(found.__getitem__, i))
@@ -265,8 +297,11 @@ class Search:
 
     def _fit(self, misfit: Misfit, start: Array, differences: Sequence[float]) -> Fit:
         """A fit of all parameters."""
-        key = key_of(misfit.hypothesis, start, misfit.noise.scale, np.array(differences))
-        return Fit(**self._kept.phase(key, lambda: vars(fit(misfit, start, _ITERATIONS, differences=differences))))
+        key = self._key(misfit.hypothesis, start, misfit.noise.scale, np.array(differences))
+        return Fit(**self._kept.phase(key, lambda: vars(fit(misfit, start, ITERATIONS, differences=differences))))
+
+    def _key(self, hypothesis: Hypothesis, *given: Array) -> str:
+        return key_of(hypothesis, np.array(self.data.fitted.measured.shape), *given)
 
     def _spoken_for(self, base: Base) -> dict[Candidate, Array]:
         """The candidates that plain parameters far outside their priors speak for; a linear screen cannot tell them.
@@ -297,7 +332,7 @@ class Search:
             if not rivals:
                 continue
             screened = self._screened(without)
-            trials = self.trials(without, [_Refit(s) for s in screened if s.candidate in rivals])
+            trials = self.trials(without, [Refit(s) for s in screened if s.candidate in rivals])
             stages.append(ranked(without, screened, {**self._in_full(without, screened, trials), effect: base}))
             best = chosen(stages[0].base, without, stages[-1].scores)
             if best is not None and best.candidate != effect:
@@ -314,67 +349,14 @@ class Search:
         return Base(hypothesis, found, errors, base.noise, base.held_out_noise, base.tolerance)
 
 
-@dataclass(frozen=True, repr=False)
-class _Refit:
-    """A task: to fit a candidate.
-
-    Attributes:
-        screened: the candidate.
-        far: coordinates of the base (d,) from which the candidate is fitted too, at the size that it then needs.
-        near: where an earlier fit ended, (d,), which this one goes on from with all derivatives taken.
-    """
-
-    screened: Screened
-    far: tuple[Array, ...] = ()
-    near: Array | None = None
-
-    @property
-    def starts(self) -> tuple[Array, ...]:
-        """All coordinates that it begins with."""
-        return (self.screened.starts, *self.far) if self.near is None else (self.near,)
-
-    def __repr__(self) -> str:
-        return str(self.screened.candidate)
+def _of_median_window(found: Fit) -> float:
+    """What a fit leaves of the median window: a mean square of whitened errors."""
+    return float(np.median(np.mean(found.errors**2, axis=(1, 2))))
 
 
-def _fitted(refit: _Refit, base: Base, fitted: Windows, held_out: Windows, num_threads: int) -> Result:
-    """The fit of a candidate, and its errors on what was held out; near the base, its derivatives are taken as known.
-
-    Where the base is far from the data or from its priors, the candidate is fitted at the size that it would need, too:
-    with what speaks for it taken away, and with all plain parameters at their priors' means. A base that an effect has
-    bent is the end of a valley that leads away from the right one. A fit that goes on from another takes them all.
-    """
-    screened, hypothesis = refit.screened, refit.screened.hypothesis
-    misfit = Misfit(hypothesis, fitted, num_threads).with_noise(base.noise)
-    if refit.near is None:
-        fits = [_fitted_from(misfit, _of_each_probe(misfit, screened.starts), base.fit.jacobian)]
-        for u in refit.far:
-            start = np.concatenate([u, hypothesis.neutral()[len(u) :]])
-            fits.append(fit(misfit, of_some_size(misfit, screened.candidate, start), _ITERATIONS))
-        found = min(fits, key=lambda f: f.loss)
-    else:
-        found = fit(misfit, refit.near, _ITERATIONS, differences=DIFFERENCES[1:])
-    test = Misfit(hypothesis, held_out, num_threads).with_noise(base.held_out_noise)
-    return {**vars(found), "held_out": base.tolerance * test.errors(found.u[None])[0]}
-
-
-def _fitted_from(misfit: Misfit, starts: Array, known: Array) -> Fit:
-    """The fit from that of some starts (k, d) which leads nearest, coarsely, as starts alone tell little."""
-    coarse = [fit(misfit, start, _ITERATIONS, known=known, differences=DIFFERENCES[:1]) for start in starts]
-    best = min(coarse, key=lambda f: f.loss)
-    return fit(misfit, best.u, _ITERATIONS, known=known, differences=DIFFERENCES[1:])
-
-
-def _of_each_probe(misfit: Misfit, starts: Array) -> Array:
-    """The best starts of the probes that have the best ones, (k, d), of those of all probes (n, d)."""
-    losses = misfit.losses(starts).reshape(-1, len(_STEPS))
-    best = np.argmin(losses, axis=1) + len(_STEPS) * np.arange(len(losses))
-    return starts[best[np.argsort(losses.min(axis=1), kind="stable")[:_FITTED_COARSELY]]]
-
-
-def _afresh(base: Base) -> Array:
-    """The base's coordinates (d,), its plain parameters at their priors' means."""
-    return np.where(np.arange(len(base.fit.u)) < base.hypothesis.num_plain, 0.0, base.fit.u)
+def _afresh(trial: Trial) -> Array:
+    """A trial's coordinates (d,), its plain parameters at their priors' means."""
+    return np.where(np.arange(len(trial.fit.u)) < trial.hypothesis.num_plain, 0.0, trial.fit.u)
 
 
 def _clipped(step: float, shift: Array, neutral: Array, hypothesis: Hypothesis, columns: list[int]) -> float:

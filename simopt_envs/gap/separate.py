@@ -118,7 +118,8 @@ def _fitted_size(explanation: Explanation, effect: Candidate, partner: Candidate
     columns = screened.hypothesis.columns[partner]
     fitted = next((score.trial.fit.u for score in stage.scores if score.candidate == partner), None)
     if fitted is None:
-        fitted = Misfit(screened.hypothesis, explanation.data.fitted).with_noise(stage.base.noise).best(screened.starts)
+        misfit = Misfit(screened.hypothesis, explanation.data.fitted).with_noise(stage.base.noise)
+        fitted = misfit.best(np.concatenate(screened.starts))
     return fitted[columns]
 
 

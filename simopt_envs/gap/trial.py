@@ -91,7 +91,7 @@ class Screened:
         hypothesis: the base's with the candidate.
         direction: what its best probe changes in the base's residual, plain parameters projected out, (m,).
         gain: in -log p, of the best multiple of that probe.
-        starts: u from which a fit may start, (k, d).
+        starts: u from which a fit may start, some for each promising probe, (n, k, d).
     """
 
     candidate: Candidate
