@@ -147,11 +147,12 @@ def _left(spec: mujoco.MjSpec, prior: Gaussian, recordings: Sequence[Recording],
     from simopt_envs.gap.plain import Plain
     from simopt_envs.gap.recordings import read_windows
     from simopt_envs.gap.search import Search
+    from simopt_envs.gap.trial import of_median_window
 
     plain = Plain.of(spec, prior)
     data = read_windows(plain.model, recordings, _HOME)
     null = Search(plain, data, motion_of(plain.model, recordings, _HOME), (), show).base()
-    return float(np.median(np.mean(null.held_out**2, axis=(1, 2))))
+    return of_median_window(null.held_out)
 
 
 def told(folder: Path) -> str:

@@ -32,7 +32,7 @@ from simopt_envs.gap.thresholds import (
     OUTLYING,
     REFITTED,
 )
-from simopt_envs.gap.trial import Base, Data, Screened, Trial
+from simopt_envs.gap.trial import Base, Data, Screened, Trial, of_median_window
 from simopt_envs.physics.effects import Motion
 from simopt_envs.physics.parameters import Array
 
@@ -138,8 +138,8 @@ class Search:
         leaves the base near to the median one, and so leaves all windows where they are.
         """
         base, data = stage.base, self.data
-        nearest = min((score.trial for score in stage.scores), key=lambda trial: _of_median_window(trial.fit))
-        if _of_median_window(base.fit) < LARGE * max(_of_median_window(nearest.fit), 1.0):
+        nearest = min((score.trial for score in stage.scores), key=lambda trial: of_median_window(trial.fit.errors))
+        if of_median_window(base.fit.errors) < LARGE * max(of_median_window(nearest.fit.errors), 1.0):
             return data
         hypothesis, u = nearest.hypothesis, nearest.fit.u
         while (fewer := without_wild_starts(hypothesis, u, data, base.sensor_noise, OUTLYING)) is not data:
@@ -347,11 +347,6 @@ class Search:
         found = self._fit(misfit.with_noise(base.noise), start, DIFFERENCES[1:])
         errors = base.tolerance * test.with_noise(base.held_out_noise).errors(found.u[None])[0]
         return Base(hypothesis, found, errors, base.noise, base.held_out_noise, base.tolerance)
-
-
-def _of_median_window(found: Fit) -> float:
-    """What a fit leaves of the median window: a mean square of whitened errors."""
-    return float(np.median(np.mean(found.errors**2, axis=(1, 2))))
 
 
 def _afresh(trial: Trial) -> Array:

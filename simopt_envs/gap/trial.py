@@ -62,6 +62,11 @@ class Trial:
         return float(np.mean(self.held_out**2)) - 1.0
 
 
+def of_median_window(errors: Array) -> float:
+    """Mean square of the whitened errors (w, S, c) of the median window: noise alone leaves 1."""
+    return float(np.median(np.mean(errors**2, axis=(1, 2))))
+
+
 @dataclass(frozen=True)
 class Base(Trial):
     """A trial that others are compared with, and the noise they are all fitted in.
