@@ -15,13 +15,14 @@ from simopt_envs.gap import find_gap
 from simopt_envs.gap.fit import Misfit, by_part
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
 from simopt_envs.gap.motion import motion_of
-from simopt_envs.gap.plain import plain_parameters
+from simopt_envs.gap.plain import Plain, plain_parameters
 from simopt_envs.gap.recordings import read_windows, whole_recordings, without_wild_starts
 from simopt_envs.gap.search import Search
 from simopt_envs.gap.thresholds import BENT, FORGOTTEN
 from simopt_envs.gap.trial import Data
 from simopt_envs.measured import Recording, WindowSimulator, cut_windows
 from simopt_envs.measured.replay import start_curvature
+from simopt_envs.measured.windows import Windows
 from simopt_envs.physics.effects import EFFECTS
 
 LOOSE = """
@@ -36,6 +37,8 @@ LOOSE = """
   <actuator><motor name="hinge" joint="hinge"/></actuator>
 </mujoco>
 """
+
+BIAS = Candidate(EFFECTS["actuator_bias"], "actuator:hinge")
 
 
 def swing(
@@ -62,6 +65,14 @@ def of_rods(upright: int) -> tuple[Data, Hypothesis]:
     windows = cut_windows(plain.model, recordings, 2.0, history=0.2)
     data = Data(windows, windows, tuple(recordings), tuple(recordings))
     return data, Hypothesis(plain, (), motion_of(plain.model, recordings))
+
+
+def of_pushed_rods(starts: Sequence[float], push: float = -0.1) -> tuple[Plain, Windows, tuple[Recording, ...]]:
+    """The model without the push, a window of 1 s for each start, and the recordings."""
+    plain = plain_parameters(mujoco.MjSpec.from_string(LOOSE.format(gravity=-9.81)))
+    recordings = swing(plain.model, starts, np.random.default_rng(0), push)
+    recordings = [part(r, r.time < 1.001) for r in recordings]
+    return plain, cut_windows(plain.model, recordings, 1.0, history=0.2), tuple(recordings)
 
 
 def part(recording: Recording, kept: np.ndarray) -> Recording:
@@ -170,20 +181,33 @@ def test_a_window_whose_start_decides_is_left_out_only_where_it_is_or_may_be_far
 @pytest.mark.parametrize(("push", "kept"), [(-0.1, 3), (0.0, 4)])
 def test_a_search_leaves_out_a_window_that_bends_the_fits_of_what_explains_the_others(push, kept):
     """Nothing explains the first rod, which stands. Without a push, the model as given explains the others."""
-    plain = plain_parameters(mujoco.MjSpec.from_string(LOOSE.format(gravity=-9.81)))
-    recordings = swing(plain.model, [0.0, 3.0, 3.1, 3.2], np.random.default_rng(0), push)
-    recordings = [part(r, r.time < 1.001) for r in recordings]
-    windows = cut_windows(plain.model, recordings, 1.0, history=0.2)
+    plain, windows, recordings = of_pushed_rods([0.0, 3.0, 3.1, 3.2], push)
     measured = windows.measured.copy()
     measured[0] += np.linspace(0.0, 1.0, measured.shape[1])[:, None] ** 2
     windows = replace(windows, measured=measured)
-    data = Data(windows, windows, tuple(recordings), tuple(recordings))
-    bias = Candidate(EFFECTS["actuator_bias"], "actuator:hinge")
-    found = Search(plain, data, motion_of(plain.model, recordings), (bias,)).run()
+    data = Data(windows, windows, recordings, recordings)
+    found = Search(plain, data, motion_of(plain.model, recordings), (BIAS,)).run()
     assert (len(found.data.fitted), len(found.data.held_out)) == (kept, kept)
     if push:
-        (size,) = found.final.hypothesis.values(bias, found.final.hypothesis.xi(found.final.fit.u[None])[0]).values()
+        (size,) = found.final.hypothesis.values(BIAS, found.final.hypothesis.xi(found.final.fit.u[None])[0]).values()
         assert size == pytest.approx(push, abs=0.002)
+
+
+@needs_effects
+@pytest.mark.parametrize(("stop", "kept"), [(2, 2), (1, 4)])
+def test_a_search_never_leaves_out_more_than_half_of_its_windows_however_often_a_candidate_tells(
+    stop, kept, monkeypatch
+):
+    def one_fewer(hypothesis: Hypothesis, u: np.ndarray, data: Data, *_: object) -> Data:
+        rows = np.arange(1, len(data.fitted))
+        fewer = replace(data, fitted=data.fitted.select(rows), held_out=data.held_out.select(rows))
+        return fewer if len(data.fitted) > stop else data
+
+    plain, windows, recordings = of_pushed_rods([3.0, 3.1, 3.2, 3.3])
+    data = Data(windows, windows, recordings, recordings)
+    monkeypatch.setattr("simopt_envs.gap.search.without_wild_starts", one_fewer)
+    found = Search(plain, data, motion_of(plain.model, recordings), (BIAS,)).run()
+    assert (len(found.data.fitted), len(found.data.held_out)) == (kept, kept)
 
 
 @needs_effects

@@ -135,7 +135,8 @@ class Search:
 
         What the candidate leaves of the others then counts little, but a fit to all has been bent by it, so it is
         fitted anew, from where that bent nothing, until it tells of no more. An effect that acts in few windows alone
-        leaves the base near to the median one, and so leaves all windows where they are.
+        leaves the base near to the median one, and so leaves all windows where they are; so does a candidate that
+        would leave out more than half of them.
         """
         base, data = stage.base, self.data
         nearest = min((score.trial for score in stage.scores), key=lambda trial: of_median_window(trial.fit.errors))
@@ -144,6 +145,9 @@ class Search:
         hypothesis, u = nearest.hypothesis, nearest.fit.u
         while (fewer := without_wild_starts(hypothesis, u, data, base.sensor_noise, OUTLYING)) is not data:
             data = fewer
+            pairs = (self.data.fitted, data.fitted), (self.data.held_out, data.held_out)
+            if any(2 * len(left) < len(windows) for windows, left in pairs):
+                return self.data
             misfit = Misfit(hypothesis, data.fitted)
             misfit = misfit.with_noise(misfit.noise_at(u, base.sensor_noise))
             u = fit(misfit, _afresh(nearest), ITERATIONS).u
