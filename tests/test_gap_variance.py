@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
-from simopt_envs.gap.fit import Fit
+from simopt_envs.gap.fit import DIFFERENCES, Fit, Misfit
+from simopt_envs.physics.parameters import Array
 
 _WINDOWS, _SAMPLES = 24, 26
 _TRIALS = 400
@@ -37,3 +41,33 @@ def test_errors_that_go_together_within_a_window_count_as_such():
 def test_independent_errors_are_worth_what_their_noise_says():
     found, said = _spread(of_window=0.0)
     assert said == pytest.approx(found, rel=0.15)
+
+
+class _TwoAsOne(Misfit):
+    """Errors that two parameters change alike, but for some roughness."""
+
+    def __init__(self, roughness: float):
+        rng = np.random.default_rng(0)
+        self._slope = rng.normal(size=(_WINDOWS, _SAMPLES, 1))
+        self._rough = roughness * rng.normal(size=(2, _WINDOWS, _SAMPLES, 1))
+        self._waves = rng.uniform(100.0, 1000.0, size=(2, _WINDOWS, _SAMPLES, 1))
+        self.hypothesis: Any = SimpleNamespace(low=np.full(2, -9.0), high=np.full(2, 9.0), prior_std=np.ones(2))
+
+    def errors(self, u: Array) -> Array:
+        each = u[:, :, None, None, None]
+        return np.sum(self._slope * each + self._rough * np.sin(self._waves * each), axis=1)
+
+
+@pytest.mark.parametrize(("roughness", "once_enough"), [(0.0, True), (0.02, False)])
+def test_what_is_rough_in_a_prediction_tells_no_two_parameters_apart(roughness, once_enough):
+    misfit, at = _TwoAsOne(roughness), np.zeros(2)
+    *_, other, small = (misfit.jacobian(at, [0, 1], difference) for difference in DIFFERENCES)
+    found = Fit(at, np.zeros((_WINDOWS, _SAMPLES, 1)), small, np.ones(2))
+    assert found.variance(other=other) == pytest.approx(0.5, rel=0.1)  # their sum alone is known
+    assert (found.variance()[0] > 0.45) == once_enough
+
+
+def test_what_other_differences_confirm_is_known_as_well_as_without():
+    jacobian = np.random.default_rng(0).normal(size=(_WINDOWS * _SAMPLES, 3))
+    fit = Fit(np.zeros(3), np.zeros((_WINDOWS, _SAMPLES, 1)), jacobian, np.array([1.0, 1.0, 100.0]))
+    np.testing.assert_allclose(fit.variance(other=jacobian), fit.variance(), rtol=1e-6)

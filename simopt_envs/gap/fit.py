@@ -68,7 +68,7 @@ class Fit:
         orthonormal, triangle = np.linalg.qr(self.rows)
         return orthonormal, triangle
 
-    def variance(self, mean_square: float = 1.0, parts: int = 1) -> Array:
+    def variance(self, mean_square: float = 1.0, parts: int = 1, other: Array | None = None) -> Array:
         """Of u, (d,): of the Gauss-Newton Hessian or, where that is more, of how far stretches of data pull it apart.
 
         The latter (White 1980, clustered by stretch) holds where errors are not what their noise says: those that a
@@ -77,13 +77,27 @@ class Fit:
         Args:
             mean_square: of whitened errors.
             parts: stretches in a window.
+            other: the Jacobian over other differences; what it does not confirm of this one tells nothing.
         """
-        rows = self.rows
+        rows, prior = self.rows, np.diag(self.prior_std**-2.0)
         inverse = np.asarray(np.linalg.pinv(rows.T @ rows, hermitian=True), dtype=np.float64)
         jacobian = self.jacobian.reshape(*self.errors.shape, len(self.u))
         pulls = by_part(np.einsum("wscd,wsc->wsd", jacobian, self.errors), parts)
-        apart = pulls.T @ pulls * len(pulls) / max(len(pulls) - 1, 1) + np.diag(self.prior_std**-2.0)
-        return np.maximum(mean_square * np.diag(inverse), np.diag(inverse @ apart @ inverse))
+        apart = pulls.T @ pulls * len(pulls) / max(len(pulls) - 1, 1) + prior
+        known = inverse if other is None else np.linalg.inv(self._confirmed(other) + prior)
+        return np.maximum(mean_square * np.diag(known), np.diag(inverse @ apart @ inverse))
+
+    def _confirmed(self, other: Array) -> Array:
+        """What the data tell of u, (d, d), as far as the Jacobian over other differences agrees.
+
+        Contacts and dry friction make derivatives rough. By that alone the columns of two parameters that are one in
+        the data differ, and either would seem to be known; but over other differences they differ in another way.
+        """
+        root = np.linalg.cholesky(self.rows.T @ self.rows)
+        whiten = np.linalg.inv(root)
+        both = self.jacobian.T @ other
+        share, axes = np.linalg.eigh(whiten @ (both + both.T) @ whiten.T / 2)
+        return np.asarray(root @ (axes * np.clip(share, 0.0, 1.0)) @ axes.T @ root.T)
 
 
 def by_part(values: Array, parts: int) -> Array:

@@ -15,6 +15,7 @@ from simopt_envs.gap.confusion import Partner, commands_file, partners
 from simopt_envs.gap.describe import Description
 from simopt_envs.gap.error import Errors
 from simopt_envs.gap.explanation import Explanation
+from simopt_envs.gap.fit import DIFFERENCES, Misfit
 from simopt_envs.gap.hypothesis import Candidate
 from simopt_envs.gap.localise import Row
 from simopt_envs.gap.repair import column_lines, difference, repaired
@@ -232,7 +233,9 @@ def named_effects(explanation: Explanation) -> tuple[Named, ...]:
     final = explanation.final
     hypothesis, u = final.hypothesis, final.fit.u
     mean_square = float(np.mean((final.held_out / final.tolerance) ** 2))
-    spread = np.sqrt(final.fit.variance(max(1.0, mean_square), explanation.data.parts))
+    misfit = Misfit(hypothesis, explanation.data.fitted).with_noise(final.noise)
+    other = misfit.jacobian(u, list(range(len(u))), DIFFERENCES[1])
+    spread = np.sqrt(final.fit.variance(max(1.0, mean_square), explanation.data.parts, other))
     ends = u + _NORMAL_95 * np.array([-spread, spread])
     xi, (low, high) = hypothesis.xi(u[None])[0], hypothesis.xi(ends)
     scores = {score.candidate: score for stage in explanation.stages for score in stage.scores}
