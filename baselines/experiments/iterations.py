@@ -129,8 +129,8 @@ def _findings(results: Results) -> list[str]:
             cures = [needed(run) for run in runs]
             before = sum(run["success"][0] <= 0.05 for run in runs)
             found.append(
-                f"{shift}: before adaptation {before} of {len(runs)} policies succeed in 5 % or less; SimOpt"
-                f" needs {count(cures, runs)} iterations in the median; the paper {paper}."
+                f"{shift}: before adaptation {before} of {len(runs)} policies succeed in 5 % or less."
+                f" Iterations that SimOpt needs, in the median: {count(cures, runs)}; the paper: {paper}."
             )
     for shift in SHIFTS:
         one, five = (list(results.get(_condition(shift, n), {}).values()) for n in (_ROLLOUTS[0], _ROLLOUTS[-1]))
