@@ -71,3 +71,11 @@ def test_what_other_differences_confirm_is_known_as_well_as_without():
     jacobian = np.random.default_rng(0).normal(size=(_WINDOWS * _SAMPLES, 3))
     fit = Fit(np.zeros(3), np.zeros((_WINDOWS, _SAMPLES, 1)), jacobian, np.array([1.0, 1.0, 100.0]))
     np.testing.assert_allclose(fit.variance(other=jacobian), fit.variance(), rtol=1e-6)
+
+
+def test_two_free_parameters_that_are_one_in_the_data_are_as_unknown_as_they_are_free():
+    """Their sum is known to a millionth, either not at all."""
+    column = 1e5 * np.random.default_rng(0).normal(size=(_WINDOWS * _SAMPLES, 1))
+    jacobian, free = np.hstack([column, column]), np.full(2, 100.0)
+    fit = Fit(np.zeros(2), np.zeros((_WINDOWS, _SAMPLES, 1)), jacobian, free)
+    assert fit.variance(other=jacobian) == pytest.approx(free**2 / 2, rel=0.1)

@@ -79,25 +79,25 @@ class Fit:
             parts: stretches in a window.
             other: the Jacobian over other differences; what it does not confirm of this one tells nothing.
         """
-        rows, prior = self.rows, np.diag(self.prior_std**-2.0)
+        rows = self.rows
         inverse = np.asarray(np.linalg.pinv(rows.T @ rows, hermitian=True), dtype=np.float64)
         jacobian = self.jacobian.reshape(*self.errors.shape, len(self.u))
         pulls = by_part(np.einsum("wscd,wsc->wsd", jacobian, self.errors), parts)
-        apart = pulls.T @ pulls * len(pulls) / max(len(pulls) - 1, 1) + prior
-        known = inverse if other is None else np.linalg.inv(self._confirmed(other) + prior)
+        apart = pulls.T @ pulls * len(pulls) / max(len(pulls) - 1, 1) + np.diag(self.prior_std**-2.0)
+        known = inverse if other is None else self._confirmed(other)
         return np.maximum(mean_square * np.diag(known), np.diag(inverse @ apart @ inverse))
 
     def _confirmed(self, other: Array) -> Array:
-        """What the data tell of u, (d, d), as far as the Jacobian over other differences agrees.
+        """Covariance of u, (d, d), if the data tell only what the Jacobian over other differences agrees on.
 
         Contacts and dry friction make derivatives rough. By that alone the columns of two parameters that are one in
         the data differ, and either would seem to be known; but over other differences they differ in another way.
         """
-        root = np.linalg.cholesky(self.rows.T @ self.rows)
-        whiten = np.linalg.inv(root)
+        whiten = np.linalg.inv(self.orthonormal[1]).T  # in the coordinates it leads to, all is known to a variance of 1
         both = self.jacobian.T @ other
         share, axes = np.linalg.eigh(whiten @ (both + both.T) @ whiten.T / 2)
-        return np.asarray(root @ (axes * np.clip(share, 0.0, 1.0)) @ axes.T @ root.T)
+        known = (axes * np.clip(share, 0.0, 1.0)) @ axes.T + (whiten * self.prior_std**-2.0) @ whiten.T
+        return np.asarray(whiten.T @ np.linalg.solve(known, whiten))
 
 
 def by_part(values: Array, parts: int) -> Array:
