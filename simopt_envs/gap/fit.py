@@ -68,24 +68,23 @@ class Fit:
         orthonormal, triangle = np.linalg.qr(self.rows)
         return orthonormal, triangle
 
-    def variance(self, mean_square: float = 1.0, parts: int = 1, other: Array | None = None) -> Array:
+    def variance(self, other: Array, mean_square: float = 1.0, parts: int = 1) -> Array:
         """Of u, (d,): of the Gauss-Newton Hessian or, where that is more, of how far stretches of data pull it apart.
 
         The latter (White 1980, clustered by stretch) holds where errors are not what their noise says: those that a
         wrong law, or a start, leaves in a stretch go together.
 
         Args:
+            other: the Jacobian over other differences; what it does not confirm of this one tells nothing.
             mean_square: of whitened errors.
             parts: stretches in a window.
-            other: the Jacobian over other differences; what it does not confirm of this one tells nothing.
         """
         rows = self.rows
         inverse = np.asarray(np.linalg.pinv(rows.T @ rows, hermitian=True), dtype=np.float64)
         jacobian = self.jacobian.reshape(*self.errors.shape, len(self.u))
         pulls = by_part(np.einsum("wscd,wsc->wsd", jacobian, self.errors), parts)
         apart = pulls.T @ pulls * len(pulls) / max(len(pulls) - 1, 1) + np.diag(self.prior_std**-2.0)
-        known = inverse if other is None else self._confirmed(other)
-        return np.maximum(mean_square * np.diag(known), np.diag(inverse @ apart @ inverse))
+        return np.maximum(mean_square * np.diag(self._confirmed(other)), np.diag(inverse @ apart @ inverse))
 
     def _confirmed(self, other: Array) -> Array:
         """Covariance of u, (d, d), if the data tell only what the Jacobian over other differences agrees on.
