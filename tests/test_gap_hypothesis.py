@@ -45,6 +45,17 @@ def test_without_any_of_an_effect_every_column_is_as_without_its_structure(arm, 
         np.testing.assert_allclose(simulated, expected, atol=5e-3 if name in _SOFT else 3e-4)
 
 
+def test_effects_can_be_tried_where_nothing_moves_or_is_measured():
+    finger = '<body><joint name="finger" type="slide" stiffness="1e6"/><geom size="0.01" contype="0"/></body>'
+    plain = plain_parameters(mujoco.MjSpec.from_string(MODEL.replace("<site", f"{finger}<site")))
+    motion = motion_of(plain.model, record(lambda q, v: np.zeros(2), np.random.default_rng(0)))
+    candidates = [Candidate(effect, "joint:finger") for effect in EFFECTS.values()]
+    candidates = [c for c in candidates if c.place in c.effect.places(plain.model)]
+    assert len(candidates) > 9
+    for candidate in candidates:
+        assert np.isfinite(Hypothesis(plain, [candidate], motion).probes(candidate)).all(), candidate
+
+
 @pytest.mark.parametrize(("name", "value"), [("joint_elasticity", 60.0), ("backlash", 0.03)])
 def test_a_link_starts_where_it_rests_under_its_load(name, value):
     plain = plain_parameters(mujoco.MjSpec.from_string(MODEL))

@@ -13,7 +13,7 @@ from simopt_envs.measured.states import estimate_states
 from simopt_envs.physics.effects import Motion
 
 _SAMPLES = 50  # of each recording
-_LEAST = 1e-6  # share of the largest: a joint that never moved has a speed
+_LEAST = 1e-6  # share of the largest: a joint that never moved has a range and a speed
 
 
 def motion_of(model: mujoco.MjModel, recordings: Sequence[Recording], keyframe: str | None = None) -> Motion:
@@ -50,9 +50,10 @@ def motion_of(model: mujoco.MjModel, recordings: Sequence[Recording], keyframe: 
     speed = np.sqrt(np.mean(velocities**2, axis=0))
     accelerating = inertia.mean(axis=0) * speed**2 / spread
     force = np.hypot(np.sqrt(np.mean(forces**2, axis=0)), accelerating)
+    low, travel = coordinates.min(axis=0), np.ptp(coordinates, axis=0)
     return Motion(
-        low=coordinates.min(axis=0),
-        high=coordinates.max(axis=0),
+        low=low,
+        high=low + np.maximum(travel, _LEAST * travel.max(initial=1.0)),
         speed=np.maximum(speed, _LEAST * speed.max(initial=1.0)),
         force=np.maximum(force, _LEAST * force.max(initial=1.0)),
         command=controls.std(axis=0),
