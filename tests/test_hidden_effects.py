@@ -153,6 +153,8 @@ def test_the_splits_have_every_effect_twice_and_no_seed_in_common():
         names[split] = {case.name for case in all_cases}
         assert len(names[split]) == len(all_cases)
     assert not names["dev"] & names["test"]
+    tasks = {hidden.effect for case in cases("dev", ("drawer", "swingpeg")) for hidden in case.hidden}
+    assert {*EFFECTS} - tasks == {"contact_friction", "joint_coupling"}  # which have no place there
     with pytest.raises(ValueError, match="no such plants: three_link"):
         cases("dev", ("three_link",))
 

@@ -78,7 +78,7 @@ def cases(split: str, among: Sequence[str] | None = None) -> list[Case]:
 
     Args:
         split: ``"dev"`` or ``"test"``.
-        among: names of plants; all that the table has by default.
+        among: names of plants; all that the table has by default. An effect that has no place in any is left out.
 
     Raises:
         ValueError: for an unknown split or plant, and where an effect can be detected in none of the plants.
@@ -89,14 +89,18 @@ def cases(split: str, among: Sequence[str] | None = None) -> list[Case]:
     names = [name for name in plants() if name in (table() if among is None else among)]
     if among is not None and (unknown := set(among) - set(table())):
         raise ValueError(f"no such plants: {', '.join(sorted(unknown))}; there are {', '.join(table())}")
+    inside, outside = (
+        [effect for effect in effects.values() if any(effect.places(plants()[name]) for name in names)]
+        for effects in (EFFECTS, OUTSIDE)
+    )
     groups: list[list[Case]] = [[], [], [], []]
-    for i, effect in enumerate(EFFECTS.values()):
+    for i, effect in enumerate(inside):
         for turn, level in enumerate(LEVELS):
             same_form = effect.forms[(i + turn + shift) % len(effect.forms)]
             groups[0].append(_single(first + 2 * i + turn, "single", effect, level, same_form, names, i + turn + shift))
     for i in range(10):
         groups[1].append(Case(first + 100 + i, names[(i + shift) % len(names)], "null"))
-        effect = list(OUTSIDE.values())[(i + shift) % len(OUTSIDE)]
+        effect = outside[(i + shift) % len(outside)]
         groups[2].append(_single(first + 200 + i, "outside", effect, LEVELS[0], False, names, i + shift))
         groups[3].append(_double(first + 300 + i, names[(i + shift) % len(names)]))
     groups[0] = [groups[0][i] for i in np.random.default_rng(first).permutation(len(groups[0]))]

@@ -150,8 +150,9 @@ class Misfit:
         data = np.sum(self.errors(u) ** 2, axis=(1, 2, 3))
         return 0.5 * (data + np.sum((u / self.hypothesis.prior_std) ** 2, axis=1))
 
-    def jacobian(self, u: Array, columns: list[int], difference: float = DIFFERENCES[-1]) -> Array:
-        """Derivative of the whitened errors by some of u (d,), (m, k), from both sides as far as bounds allow."""
+    def jacobian(self, u: Array, columns: Sequence[int] | None = None, difference: float = DIFFERENCES[-1]) -> Array:
+        """Derivative of the whitened errors by all of u (d,), or some, (m, k), from both sides where bounds allow."""
+        columns = range(len(u)) if columns is None else columns
         ends = np.tile(u, (2, len(columns), 1))
         both = np.array([[-difference], [difference]])
         reached = np.clip(u[columns] + both, self.hypothesis.low[columns], self.hypothesis.high[columns])

@@ -27,7 +27,7 @@ def unforeseen(base: Base, held_out: Windows) -> float:
     if np.any(base.tolerance > 1) or np.mean(base.fit.errors**2) > EXPLAINED:
         return base.excess
     u = base.fit.u
-    jacobian = Misfit(base.hypothesis, held_out).with_noise(base.held_out_noise).jacobian(u, list(range(len(u))))
+    jacobian = Misfit(base.hypothesis, held_out).with_noise(base.held_out_noise).jacobian(u)
     slope = jacobian.T @ base.held_out.ravel()
     information = base.fit.rows.T @ base.fit.rows + jacobian.T @ jacobian
     foreseen = float(slope @ np.linalg.solve(information, slope))  # r'r - r'(I + J P J')⁻¹ r, by Woodbury's identity

@@ -234,7 +234,7 @@ def named_effects(explanation: Explanation) -> tuple[Named, ...]:
     hypothesis, u = final.hypothesis, final.fit.u
     mean_square = float(np.mean((final.held_out / final.tolerance) ** 2))
     misfit = Misfit(hypothesis, explanation.data.fitted).with_noise(final.noise)
-    other = misfit.jacobian(u, list(range(len(u))), DIFFERENCES[1])
+    other = misfit.jacobian(u, difference=DIFFERENCES[1])
     spread = np.sqrt(final.fit.variance(other, max(1.0, mean_square), explanation.data.parts))
     ends = u + _NORMAL_95 * np.array([-spread, spread])
     xi, (low, high) = hypothesis.xi(u[None])[0], hypothesis.xi(ends)
