@@ -274,23 +274,23 @@ def test_the_model_at_the_median_of_p_is_the_one_that_its_parameters_write(env_i
 
 
 def test_the_search_starts_from_the_distribution_that_leaves_least(tmp_path, monkeypatch):
-    load = {"effect": "payload", "where": "body:link7", "parameters": {"mass": 2.5}}
+    load = {"effect": "payload", "where": "body:link7", "parameters": {"mass": 0.3}}
     robot = LoggedSystem(with_effects(DRAWER, [load]), tmp_path / "logs", noise=0.002)
     logs = [robot.log(trajectory) for trajectory in robot.rollout(Wave(), 2, np.random.default_rng(1))]
-    space = gym.make(DRAWER).unwrapped.parameters.subset(["cabinet_x"])
-    first, bent = Gaussian(space, [0.0], [[0.02**2]]), Gaussian(space, [0.15], [[0.005**2]])
+    space = gym.make(DRAWER).unwrapped.parameters.subset(["joint_damping_2"])
+    first = Gaussian.around_nominal(space, std=0.1)
+    bent = Gaussian(space, first.mean - np.log(4.0), [[0.005**2]])
     searched = []
 
     def search(spec, recordings, *, plain, **_):
-        searched.append((spec.compile().body("cabinet").pos[0], plain.std[0]))
+        searched.append((spec.compile().joint("joint2").damping[0], plain.std[0]))
         raise InterruptedError
 
     monkeypatch.setattr("simopt_envs.gap.find_gap", search)
-    at_nominal = environment(DRAWER)[0].compile().body("cabinet").pos[0]
     for distributions in ([bent, first], [first, bent]):
         with pytest.raises(InterruptedError):
             explain(DRAWER, distributions, logs, tmp_path / "gap", Console())
-        assert searched.pop() == pytest.approx((at_nominal, 0.02))
+        assert searched.pop() == pytest.approx((space.nominal[0], 0.1))
 
 
 def test_effects_join_xi_with_their_intervals_but_for_what_an_environment_does_not_have():

@@ -274,6 +274,8 @@ def test_windows_leave_out_gaps_and_missing_starts():
     np.testing.assert_allclose(cut_windows(model, recording, 0.5).start_time, np.arange(7) * 0.5)
     np.testing.assert_allclose(cut_windows(model, holed, 0.5).start_time, [0, 0.5, 2.0, 2.5, 3.0])
     np.testing.assert_allclose(cut_windows(model, recording, 0.5, step=0.25).start_time, np.arange(14) * 0.25)
+    centred = cut_windows(model, recording, 0.5, centred=True)  # of 0.498 s that are left over, a half at either end
+    np.testing.assert_allclose(centred.start_time, 0.248 + np.arange(7) * 0.5)
     values = recording["qpos/slide"].copy()
     values[995:1010] = np.nan  # the start of the window at 2 s
     missing = replace(recording, columns={**recording.columns, "qpos/slide": values})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import mujoco
 import numpy as np
@@ -49,6 +50,9 @@ def split(recordings: Sequence[Recording]) -> tuple[list[Recording], list[Record
 def read_windows(model: mujoco.MjModel, recordings: Sequence[Recording], keyframe: str | None = None) -> Data:
     """Windows of audited recordings, half of them held out; the last field tells of what the audit found.
 
+    What windows leave over is left at both ends: smoothed positions tell least there of how a state was, and a robot
+    that sets off where its recording begins would seem to be on its way already.
+
     Raises:
         ValueError: where the audit found an error, recordings are of different models, or no window fits.
     """
@@ -64,9 +68,10 @@ def read_windows(model: mujoco.MjModel, recordings: Sequence[Recording], keyfram
     shortest = min(recording.duration for recording in [*fitted, *held_out])
     seconds = min(WINDOW, shortest)
     warnings += warnings_of(checked)
+    cut = partial(cut_windows, model, seconds=seconds, keyframe=keyframe, history=2 * LONGEST, centred=True)
     return Data(
-        cut_windows(model, fitted, seconds, keyframe=keyframe, history=2 * LONGEST),
-        cut_windows(model, held_out, seconds, keyframe=keyframe, history=2 * LONGEST),
+        cut(fitted),
+        cut(held_out),
         tuple(fitted),
         tuple(held_out),
         warnings,

@@ -74,6 +74,7 @@ def cut_windows(
     step: float | None = None,
     keyframe: str | None = None,
     history: float = 0.0,
+    centred: bool = False,
 ) -> Windows:
     """Cut recordings into windows with estimated starts.
 
@@ -87,6 +88,7 @@ def cut_windows(
         step: seconds between starts; the length by default, so that windows do not overlap.
         keyframe: where joints without a column start, see :func:`estimate_states`.
         history: seconds of commands before the start to keep, at least as many as the model's delays need.
+        centred: whether what windows leave over of a recording is left at both ends alike, instead of at the end.
 
     Raises:
         ValueError: if an actuator has no column, no column names anything in the model, recordings differ in their
@@ -108,7 +110,8 @@ def cut_windows(
     past = max(_longest_history(model), int(np.ceil(history / timestep)) + 1)
     parts = []
     for recording, grid in zip(recordings, grids, strict=True):
-        starts = np.arange(0, len(grid) - samples + 1, hop)[: 1 if seconds is None else None]
+        last = len(grid) - samples
+        starts = np.arange(last % hop // 2 if centred else 0, last + 1, hop)[: 1 if seconds is None else None]
         starts = starts[[_is_usable(recording.in_order(), grid, s, s + samples - 1) for s in starts]]
         if not len(starts):
             continue
