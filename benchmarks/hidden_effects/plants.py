@@ -316,15 +316,15 @@ def _task_motion(task: str, index: int, rng: np.random.Generator) -> Motion:
     return Motion(np.concatenate([np.repeat(at_rest[None], rest, axis=0), reference]), rest + cut, qpos)
 
 
-def _task(name: str, site: str, exact: tuple[str, ...], places: frozenset[str]) -> Plant:
-    """A registered task as ``export_tasks`` wrote it."""
+def _task(name: str, site: str, fingers: tuple[str, ...], exact: tuple[str, ...], places: frozenset[str]) -> Plant:
+    """A registered task as ``export_tasks`` wrote it, its robot's joints and fingers measured."""
     return Plant(
         name,
         (_TASKS / f"{name}.xml").read_text(),
         rate=50.0,
         duration=3.0,
         noise={"qpos": 5e-4, "site": 1e-3},
-        encoders=tuple(f"joint{i}" for i in range(1, 8)),
+        encoders=(*(f"joint{i}" for i in range(1, 8)), *fingers),
         sites=(site,),
         sensors=(),
         motion=partial(_task_motion, name),
@@ -373,8 +373,14 @@ def plants() -> dict[str, Plant]:
             feedback=Feedback(stiffness=15000.0, damping=2000.0),
             window=0.5,
         ),
-        _task("drawer", "handle", (), frozenset({"joint2", "joint4", "joint6", "link4", "hand", "drawer", "handle"})),
-        _task("swingpeg", "peg", ("segment",), frozenset({"joint2", "joint4", "link4", "gripper", "peg"})),
+        _task(
+            "drawer",
+            "handle",
+            ("finger_left", "finger_right"),
+            (),
+            frozenset({"joint2", "joint4", "joint6", "link4", "hand", "drawer", "handle"}),
+        ),
+        _task("swingpeg", "peg", (), ("segment",), frozenset({"joint2", "joint4", "link4", "gripper", "peg"})),
     ]
     return {plant.name: plant for plant in own}
 
