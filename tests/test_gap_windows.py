@@ -215,3 +215,10 @@ def test_a_search_needs_something_to_look_for():
     recordings = record(lambda q, v: np.zeros(2), np.random.default_rng(1))
     with pytest.raises(ValueError, match="none of the effects can act"):
         find_gap(mujoco.MjSpec.from_string(MODEL), recordings, effects=[EFFECTS["contact_friction"]])
+
+
+def test_windows_keep_off_both_ends_of_a_recording():
+    recordings = record(lambda q, v: np.zeros(2), np.random.default_rng(0), seconds=2.3)
+    data = read_windows(mujoco.MjModel.from_xml_string(MODEL), recordings)
+    for windows in (data.fitted, data.held_out):
+        np.testing.assert_allclose(windows.start_time, np.tile([0.14, 0.64, 1.14, 1.64], 2))
