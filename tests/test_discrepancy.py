@@ -125,6 +125,18 @@ def test_verdict():
         assert label in str(verdict)
 
 
+@pytest.mark.parametrize(("turning", "label"), [(True, "unexplained"), (False, "uninformative")])
+def test_quick_motion_is_not_taken_for_noise(turning, label):
+    """Reversing at every step looks like noise in third differences, but then it would not cancel so well over time."""
+    rng = np.random.default_rng(6)
+    size = np.ones(60) if turning else rng.standard_normal(60)
+    velocity = np.concatenate([[0.0], size * (-1.0) ** np.arange(60)])[:, None]
+    real, discrepancy = [Trajectory(velocity, np.zeros((60, 1)))], Discrepancy()
+    costs = np.array([0.5, 1.0]) * discrepancy.of_motion(real)
+    verdict = judge(discrepancy, costs, real, rng)
+    assert (verdict.label, verdict.noise == 0.0) == (label, turning), verdict
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

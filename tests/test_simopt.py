@@ -8,6 +8,8 @@ import pytest
 from toy_reach import SPACE, LeanTrainer, PushPolicy, ReachEnv
 
 from simopt_envs.adaptation import Discrepancy, EnvSimulator, HiddenSystem, SimOpt
+from simopt_envs.adaptation.search import further_out, is_stuck, update_further_out
+from simopt_envs.adaptation.updates import REPS
 from simopt_envs.distributions import Gaussian
 
 XI = SPACE.subset(["gain", "force"])
@@ -44,6 +46,59 @@ def test_leaves_alone_what_is_right(seed):
     assert first.target_success == last.target_success == 1.0
     assert first.verdict.label == "explained"
     assert (np.abs(last.distribution.mean - START.mean) < 0.5 * START.std).all()
+
+
+@pytest.mark.parametrize("looks_further", [True, False])
+def test_looks_further_where_it_is_stuck(looks_further, monkeypatch):
+    """Nothing moves in any simulation from within four standard deviations of nominal."""
+    if not looks_further:
+        monkeypatch.setattr("simopt_envs.adaptation.simopt.is_stuck", lambda lowest, explained: False)
+    latched = partial(ReachEnv, latch=0.8)
+    counts = {"simulated_rollouts": 120, "real_rollouts": 1, "updates_per_iteration": 12, "evaluation_episodes": 0}
+    loop = SimOpt(
+        EnvSimulator(latched),
+        START,
+        LeanTrainer(),
+        HiddenSystem(latched, {"force": 1.0}, noise=0.002),
+        seed=0,
+        **counts,
+    )
+    *_, last = loop.run(1)
+    found = last.distribution.median[1] == pytest.approx(1.0, abs=0.1)
+    assert (found, last.verdict.label != "unexplained") == (looks_further, looks_further)
+
+
+@pytest.mark.parametrize(
+    ("lowest", "stuck"),
+    [
+        ([], False),
+        ([9, 9, 9], False),
+        ([9, 9, 9, 9], True),  # three brought nothing
+        ([9, 8, 7, 6, 5], False),
+        ([9, 8.7, 8.4, 8, 7.7, 7.4, 7.1], False),  # a tenth within three
+        ([9, 9, 9, 9, (4, 9), (4, 9), (4, 9)], True),  # one that looked further out brought much
+        ([9, 9, 9, 9, (0.5, 9), (0.5, 9), (0.5, 9), (0.5, 2)], True),  # p(ξ) is on its way to what explains
+        ([9, 9, 9, 9, (0.5, 9), (0.5, 0.9)], False),  # there
+        ([9, 9, 9, 9, (0.5, 0.9), 9, 9, np.inf], False),
+        ([9, 9, 9, 9, (0.5, 0.9), 9, 9, 9, np.inf], True),
+    ],
+)
+def test_is_stuck(lowest, stuck):
+    """Lowest costs of updates; of those that looked further out also the lowest of what p(ξ) drew itself."""
+    assert is_stuck([np.broadcast_to(costs, 2).astype(float) for costs in lowest], explained=1.0) is stuck
+
+
+def test_draws_further_out_do_not_widen_what_costs_do_not_tell():
+    """Half of the draws are three times as wide, all are valid, and p(ξ) keeps its width where costs are noise."""
+    rng = np.random.default_rng(0)
+    xi = further_out(START, START.sample(20_000, rng))
+    assert XI.contains(xi).all()
+    np.testing.assert_allclose(XI.to_unconstrained(xi[::2]).std(axis=0), 3 * START.std, rtol=0.03)
+    np.testing.assert_allclose(XI.to_unconstrained(xi[1::2]).std(axis=0), START.std, rtol=0.03)
+    uninformed = update_further_out(REPS(), START, xi, rng.uniform(size=len(xi)), rng, 0.0).distribution
+    np.testing.assert_allclose(uninformed.std, START.std, rtol=0.05)
+    informed = update_further_out(REPS(), START, xi, np.abs(xi[:, 1] - 0.8), rng, 0.0).distribution
+    assert informed.mean[1] > START.mean[1] + 2 * START.std[1]
 
 
 def test_says_when_no_parameter_explains_it():

@@ -22,10 +22,11 @@ SPACE = ParameterSpace(
 OBSERVATION, ACTION = spaces.Box(-np.inf, np.inf, (2,), np.float64), spaces.Box(-2.0, 2.0, (1,), np.float64)
 
 
-def advance(state, action, xi, time, disturbance):
+def advance(state, action, xi, time, disturbance, latch=-np.inf):
     """One step of n worlds: states (n, 2), actions (n, 1), ξ (n, 3)."""
     push = xi[:, 0] * np.clip(action[:, 0], -2, 2) + xi[:, 1] - xi[:, 2] * state[:, 1]
     velocity = state[:, 1] + DT * (push + disturbance * np.sin(1.5 * DT * time))
+    velocity = np.where(xi[:, 1] < latch, 0.0, velocity)
     return np.stack([state[:, 0] + DT * velocity, velocity], 1)
 
 
@@ -79,14 +80,14 @@ class ReachVectorEnv(gym.vector.VectorEnv):
 
 
 class ReachEnv(gym.Env):
-    """One world."""
+    """One world. ``latch``: the force that it takes to let go of the mass."""
 
     observation_space, action_space, parameters = OBSERVATION, ACTION, SPACE
     discrepancy_weights = np.array([1.0, 0.5])
     observation_names = ("position", "velocity")
 
-    def __init__(self, disturbance=0.0):
-        self.disturbance = disturbance
+    def __init__(self, disturbance=0.0, latch=-np.inf):
+        self.disturbance, self.latch = disturbance, latch
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -99,7 +100,7 @@ class ReachEnv(gym.Env):
         return self.state[0].copy(), {"parameters": SPACE.as_dict(self.xi[0])}
 
     def step(self, action):
-        self.state = advance(self.state, np.asarray(action)[None], self.xi, self.time, self.disturbance)
+        self.state = advance(self.state, np.asarray(action)[None], self.xi, self.time, self.disturbance, self.latch)
         self.time += 1
         distance = abs(self.state[0, 0] - GOAL)
         return self.state[0].copy(), -distance, False, self.time >= STEPS, {"is_success": bool(distance < 0.05)}

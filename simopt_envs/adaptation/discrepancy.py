@@ -159,7 +159,7 @@ class Verdict:
             and these rollouts cannot tell them apart. "unexplained": none is; either p(ξ) has not arrived yet or, if
             it no longer moves, the real system does what no ξ can express.
         best: lowest cost of a ξ drawn.
-        noise: cost of the measurement noise alone, its 95 % quantile.
+        noise: cost of the measurement noise alone, its 95 % quantile; 0 where motion is too quick to tell noise from.
         motion: cost of a model in which nothing moves.
         threshold: costs up to here count as explained.
     """
@@ -196,8 +196,10 @@ def judge(
             best ξ, and a policy in closed loop reacts to the noise.
         motion_fraction: so is a cost up to this fraction of that of no motion, which matters where there is no noise.
     """
-    noise = float(np.quantile(discrepancy.of_noise(real, rng), 0.95))
+    least, noise = np.quantile(discrepancy.of_noise(real, rng), [0.01, 0.95]).tolist()
     motion = discrepancy.of_motion(real)
+    if least > motion:  # measurements with such noise would hardly differ so little: it was quick motion
+        noise = 0.0
     threshold = max(noise_factor * noise, motion_fraction * motion)
     finite = costs[np.isfinite(costs)]
     best = float(finite.min(initial=np.inf))

@@ -17,6 +17,7 @@ from simopt_envs.adaptation.checkpoint import Checkpoint, Content, Result, ident
 from simopt_envs.adaptation.discrepancy import Discrepancy, Verdict, judge
 from simopt_envs.adaptation.protocols import EvaluableSystem, PersistentTrainer, Policy, RealSystem, Trainer
 from simopt_envs.adaptation.records import Event, Iteration, pack_trajectories, unpack_trajectories
+from simopt_envs.adaptation.search import OWN, further_out, is_stuck, update_further_out
 from simopt_envs.adaptation.simulator import EnvSimulator, Simulator
 from simopt_envs.adaptation.updates import REPS, Update
 from simopt_envs.distributions.gaussian import Gaussian
@@ -58,7 +59,8 @@ class SimOpt:
         update: how p(ξ) moves; REPS by default.
         simulated_rollouts: simulated episodes of one update; each ξ drawn takes ``real_rollouts`` of them.
         real_rollouts: episodes measured on the real system per iteration.
-        updates_per_iteration: updates on the same measured episodes, each from ξ drawn anew.
+        updates_per_iteration: updates on the same measured episodes, each from ξ drawn anew; from further out once they
+            have come to a standstill and nothing drawn explains the episodes (:mod:`simopt_envs.adaptation.search`).
         evaluation_episodes: episodes that count successes on a system that has ``evaluate``; never used to adapt.
         seed: of everything that is random.
         directory: where ``result.json`` and checkpoints are written; None writes nothing.
@@ -146,7 +148,8 @@ class SimOpt:
             updates: list[Result] = []
             if measurement is not None:
                 for j in range(self.updates_per_iteration):
-                    updates.append(self._update(checkpoint, k, j, distribution, policy, measurement))
+                    stuck = is_stuck([u["costs"] for u in updates], measurement.verdict.threshold)
+                    updates.append(self._update(checkpoint, k, j, distribution, policy, measurement, stuck))
                     distribution = Gaussian.from_dict(
                         json.loads(str(updates[-1]["distribution"])), self.distribution.space
                     )
@@ -259,17 +262,22 @@ class SimOpt:
         distribution: Gaussian,
         policy: Policy | None,
         measurement: _Measurement,
+        stuck: bool,
     ) -> Result:
-        """One step of p(ξ) towards the measured episodes."""
+        """One step of p(ξ) towards the measured episodes, from draws further out if the steps before got stuck."""
         draws, random, noise = self._rngs(k, "update", 3, j)
 
         def compute() -> Content:
             xi, costs = measurement.xi, measurement.costs
             if j > 0:
-                xi, costs, _, _ = self._simulate(distribution, policy, measurement.real, draws)
-            arrived = judge(self.discrepancy, costs, measurement.real, noise).label != "unexplained"
+                xi, costs, _, _ = self._simulate(distribution, policy, measurement.real, draws, stuck)
+            own = costs[OWN] if stuck else costs
+            arrived = judge(self.discrepancy, own, measurement.real, noise).label != "unexplained"
             floor = (_FLOOR_ARRIVED if arrived else _FLOOR_SEARCHING) * self.distribution.std
-            step = self.update(distribution, xi, costs, random, std_floor=floor)
+            if stuck:
+                step = update_further_out(self.update, distribution, xi, costs, random, floor)
+            else:
+                step = self.update(distribution, xi, costs, random, std_floor=floor)
             return {
                 "distribution": json.dumps(step.distribution.to_dict()),
                 "kl": step.kl,
@@ -282,10 +290,17 @@ class SimOpt:
         return self._phase(checkpoint, k, f"update_{j}", compute)
 
     def _simulate(
-        self, distribution: Gaussian, policy: Policy | None, real: Sequence[Trajectory], rng: np.random.Generator
+        self,
+        distribution: Gaussian,
+        policy: Policy | None,
+        real: Sequence[Trajectory],
+        rng: np.random.Generator,
+        stuck: bool = False,
     ) -> tuple[Array, Array, list[Trajectory], float | None]:
         """ξ ~ p(ξ), their costs, the episodes of the best, and the share of successes."""
         xi = distribution.sample(self.simulated_rollouts // len(real), rng)
+        if stuck:
+            xi = further_out(distribution, xi)
         rollouts = self.simulator.rollout(policy, distribution.space, xi, real, int(rng.integers(2**31)))
         costs = self.discrepancy(rollouts, real)
         if not np.isfinite(costs).any():
