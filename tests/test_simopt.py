@@ -77,7 +77,9 @@ def test_looks_further_where_it_is_stuck(looks_further, monkeypatch):
         ([9, 8, 7, 6, 5], False),
         ([9, 8.7, 8.4, 8, 7.7, 7.4, 7.1], False),  # a tenth within three
         ([9, 9, 9, 9, (4, 9), (4, 9), (4, 9)], True),  # one that looked further out brought much
-        ([9, 9, 9, 9, (0.5, 9), (0.5, 9), (0.5, 9), (0.5, 2)], True),  # p(ξ) is on its way to what explains
+        ([9, 9, 9, 9, 9, 9, 9], False),  # three that looked further out brought nothing either
+        ([9, 9, 9, 9, 9, 9, 9, 9, 9, 9], True),
+        ([9, 9, 9, 9, (0.5, 9), (0.5, 4)], True),  # p(ξ) is on its way to what explains
         ([9, 9, 9, 9, (0.5, 9), (0.5, 0.9)], False),  # there
         ([9, 9, 9, 9, (0.5, 0.9), 9, 9, np.inf], False),
         ([9, 9, 9, 9, (0.5, 0.9), 9, 9, 9, np.inf], True),

@@ -29,7 +29,8 @@ def is_stuck(costs: Sequence[Array], explained: float) -> bool:
     """Whether the next update should look further out.
 
     It should once three updates on end have not brought the lowest cost down by a tenth, until a ξ that p(ξ) drew
-    itself explains the measurements.
+    itself explains the measurements; or until three that looked further out have not brought it down either, then it
+    is the turn of three others.
 
     Args:
         costs: of the ξ that each update so far drew.
@@ -41,9 +42,8 @@ def is_stuck(costs: Sequence[Array], explained: float) -> bool:
             stuck, waited, lowest = False, 0, np.inf
         elif drawn.min() < (1 - _LEAST_GAIN) * lowest:
             waited, lowest = 0, drawn.min()
-        else:
-            waited += 1
-            stuck = stuck or waited == _PATIENCE
+        elif (waited := waited + 1) == _PATIENCE:
+            stuck, waited = not stuck, 0
     return stuck
 
 
@@ -58,7 +58,12 @@ def further_out(p: Gaussian, xi: Array) -> Array:
 def update_further_out(
     rule: Update, p: Gaussian, xi: Array, costs: Array, rng: np.random.Generator, std_floor: ArrayLike
 ) -> UpdateResult:
-    """What a rule makes of draws that :func:`further_out` made; its KL bound is that of the wider Gaussian."""
+    """What a rule makes of draws that :func:`further_out` made: of all, or of p(ξ)'s own if the best is among them.
+
+    Where all count, its KL bound is that of the wider Gaussian.
+    """
+    if costs[OWN].min() <= costs[_FAR].min():
+        return rule(p, xi[OWN], costs[OWN], rng, std_floor)
     step = rule(_scaled(p, _WIDTH), xi, costs, rng, std_floor=_WIDTH * np.asarray(std_floor))
     return replace(step, distribution=_scaled(step.distribution, 1 / _WIDTH))
 
