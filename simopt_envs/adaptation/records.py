@@ -40,7 +40,7 @@ class Iteration:
         index: 0 is before any adaptation.
         distribution: p(ξ) of this iteration.
         policy: trained under it, or the fixed one; None where recordings are replayed.
-        kl: largest KL divergence of the single updates that led here; 0 in iteration 0.
+        kl: largest KL divergence of the single updates that led here, as their rule bounds it; 0 in iteration 0.
         total_kl: KL divergence of ``distribution`` from that of the iteration before.
         effective_sample_size: the smallest of those updates; None in iteration 0.
         relevance: (d,), within [0, 1], how far the costs of the last update spoke about each parameter; None in
