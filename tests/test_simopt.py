@@ -8,7 +8,7 @@ import pytest
 from toy_reach import SPACE, LeanTrainer, PushPolicy, ReachEnv
 
 from simopt_envs.adaptation import Discrepancy, EnvSimulator, HiddenSystem, SimOpt
-from simopt_envs.adaptation.search import further_out, is_stuck, update_further_out
+from simopt_envs.adaptation.search import is_stuck, own_and_far, sample_further_out, update_further_out
 from simopt_envs.adaptation.updates import REPS
 from simopt_envs.distributions import Gaussian
 
@@ -76,31 +76,37 @@ def test_looks_further_where_it_is_stuck(looks_further, monkeypatch):
         ([9, 9, 9, 9], True),  # three brought nothing
         ([9, 8, 7, 6, 5], False),
         ([9, 8.7, 8.4, 8, 7.7, 7.4, 7.1], False),  # a tenth within three
-        ([9, 9, 9, 9, (4, 9), (4, 9), (4, 9)], True),  # one that looked further out brought much
+        ([9, 9, 9, 9, (9, 4), (9, 4), (9, 4)], True),  # one that looked further out brought much
         ([9, 9, 9, 9, 9, 9, 9], False),  # three that looked further out brought nothing either
         ([9, 9, 9, 9, 9, 9, 9, 9, 9, 9], True),
-        ([9, 9, 9, 9, (0.5, 9), (0.5, 4)], True),  # p(ξ) is on its way to what explains
-        ([9, 9, 9, 9, (0.5, 9), (0.5, 0.9)], False),  # there
-        ([9, 9, 9, 9, (0.5, 0.9), 9, 9, np.inf], False),
-        ([9, 9, 9, 9, (0.5, 0.9), 9, 9, 9, np.inf], True),
+        ([9, 9, 9, 9, (9, 0.5), (4, 0.5)], True),  # p(ξ) is on its way to what explains
+        ([9, 9, 9, 9, (9, 0.5), (0.9, 0.5)], False),  # there
+        ([9, 9, 9, 9, (0.9, 0.5), 9, 9, np.inf], False),
+        ([9, 9, 9, 9, (0.9, 0.5), 9, 9, 9, np.inf], True),
     ],
 )
 def test_is_stuck(lowest, stuck):
-    """Lowest costs of updates; of those that looked further out also the lowest of what p(ξ) drew itself."""
+    """Lowest costs of updates; of those that looked further out, of p(ξ)'s own draws and of the others."""
     assert is_stuck([np.broadcast_to(costs, 2).astype(float) for costs in lowest], explained=1.0) is stuck
 
 
-def test_draws_further_out_do_not_widen_what_costs_do_not_tell():
+def test_goes_on_from_further_out_only_where_that_is_better():
     """Half of the draws are three times as wide, all are valid, and p(ξ) keeps its width where costs are noise."""
     rng = np.random.default_rng(0)
-    xi = further_out(START, START.sample(20_000, rng))
+    moved = Gaussian(XI, START.mean - np.array([0.0, 0.5]), START.covariance / 4)
+    xi = sample_further_out(moved, START, 40_000, rng)
     assert XI.contains(xi).all()
-    np.testing.assert_allclose(XI.to_unconstrained(xi[::2]).std(axis=0), 3 * START.std, rtol=0.03)
-    np.testing.assert_allclose(XI.to_unconstrained(xi[1::2]).std(axis=0), START.std, rtol=0.03)
-    uninformed = update_further_out(REPS(), START, xi, rng.uniform(size=len(xi)), rng, 0.0).distribution
-    np.testing.assert_allclose(uninformed.std, START.std, rtol=0.05)
-    informed = update_further_out(REPS(), START, xi, np.abs(xi[:, 1] - 0.8), rng, 0.0).distribution
-    assert informed.mean[1] > START.mean[1] + 2 * START.std[1]
+    for drawn, p, width in zip(own_and_far(XI.to_unconstrained(xi)), (moved, START), (1, 3), strict=True):
+        np.testing.assert_allclose(drawn.mean(axis=0), p.mean, atol=0.01)
+        np.testing.assert_allclose(drawn.std(axis=0), width * p.std, rtol=0.03)
+    force = xi[:, 1]
+    better = update_further_out(REPS(), moved, START, xi, np.abs(force - 0.8), rng, 0.0).distribution
+    assert better.mean[1] > START.mean[1] + 2 * START.std[1]
+    assert better.std[0] == pytest.approx(START.std[0], rel=0.05)
+    costs = np.abs(force + 0.5)
+    own, own_costs = own_and_far(xi)[0], own_and_far(costs)[0]
+    as_ever = update_further_out(REPS(), moved, START, xi, costs, rng, 0.0).distribution
+    np.testing.assert_array_equal(as_ever.mean, REPS()(moved, own, own_costs, rng, 0.0).distribution.mean)
 
 
 def test_says_when_no_parameter_explains_it():

@@ -1,9 +1,10 @@
 """Drawing ξ further out than p(ξ) reaches, where its updates have come to a standstill.
 
 Contacts make costs flat or misleading near p(ξ): while every simulated peg meets the wall of the box, nothing tells
-that with a longer rope it would not. Draws from p(ξ) then lead to the bottom of a valley in which nothing explains
-what was measured. So every second draw goes three times as far, and the update sees a Gaussian as wide as all of
-them; the new p(ξ) has the new mean, and has changed its width as that Gaussian has.
+that with a longer rope it would not, and updates go to the bottom of a valley in which nothing explains what was
+measured. So half of the draws go three times as far as p(ξ) did when its updates began. Where the best of them is
+better than the best of p(ξ)'s own, p(ξ) goes on from there instead: as that wider Gaussian is updated by them, with its
+own width.
 """
 
 from __future__ import annotations
@@ -18,19 +19,16 @@ from simopt_envs.adaptation.updates import Update, UpdateResult
 from simopt_envs.distributions.gaussian import Gaussian
 from simopt_envs.physics.parameters import Array
 
-_PATIENCE, _LEAST_GAIN = 3, 0.1
-_FARTHER, _FAR = 3.0, slice(0, None, 2)
-OWN = slice(1, None, 2)
-"""Which of the draws that :func:`further_out` made are p(ξ)'s own."""
-_WIDTH = np.sqrt((1 + _FARTHER**2) / 2)
+_PATIENCE, _GAIN = 3, 0.1
+_FARTHER = 3.0
 
 
 def is_stuck(costs: Sequence[Array], explained: float) -> bool:
-    """Whether the next update should look further out.
+    """Whether half of the next update's draws should go further out.
 
-    It should once three updates on end have not brought the lowest cost down by a tenth, until a ξ that p(ξ) drew
-    itself explains the measurements; or until three that looked further out have not brought it down either, then it
-    is the turn of three others.
+    They should once three updates on end have not brought the lowest cost down by a tenth, until a ξ that p(ξ) drew
+    itself explains the measurements; or until three such updates have not brought it down either, then it is the turn
+    of three others.
 
     Args:
         costs: of the ξ that each update so far drew.
@@ -38,34 +36,53 @@ def is_stuck(costs: Sequence[Array], explained: float) -> bool:
     """
     stuck, waited, lowest = False, 0, np.inf
     for drawn in costs:
-        if (drawn[OWN] if stuck else drawn).min() <= explained:
+        if (own_and_far(drawn)[0] if stuck else drawn).min() <= explained:
             stuck, waited, lowest = False, 0, np.inf
-        elif drawn.min() < (1 - _LEAST_GAIN) * lowest:
+        elif drawn.min() < (1 - _GAIN) * lowest:
             waited, lowest = 0, drawn.min()
         elif (waited := waited + 1) == _PATIENCE:
             stuck, waited = not stuck, 0
     return stuck
 
 
-def further_out(p: Gaussian, xi: Array) -> Array:
-    """Draws (n, d) of p(ξ), every second of them three times as far from its median, within the bounds."""
-    further = xi.copy()
-    offset = p.space.to_unconstrained(xi[_FAR]) - p.mean
-    further[_FAR] = np.clip(p.space.from_unconstrained(p.mean + _FARTHER * offset), p.space.low, p.space.high)
-    return further
+def sample_further_out(p: Gaussian, start: Gaussian, n: int, rng: np.random.Generator) -> Array:
+    """Draws (n, d), physical: of p(ξ), and then as many three times as far out as those of ``start``, within bounds."""
+    own, space = p.sample(n - n // 2, rng), p.space
+    offset = space.to_unconstrained(start.sample(n // 2, rng)) - start.mean
+    far = space.from_unconstrained(start.mean + _FARTHER * offset)
+    return np.concatenate([own, np.clip(far, space.low, space.high)])
+
+
+def own_and_far(drawn: Array) -> tuple[Array, Array]:
+    """What :func:`sample_further_out` drew, or its costs: of p(ξ) itself, and further out."""
+    own = len(drawn) - len(drawn) // 2
+    return drawn[:own], drawn[own:]
+
+
+def is_better_further_out(costs: Array) -> bool:
+    """Whether the best ξ further out is better than the best that p(ξ) drew itself, by a tenth."""
+    own, far = own_and_far(costs)
+    return bool(far.min() < (1 - _GAIN) * own.min())
 
 
 def update_further_out(
-    rule: Update, p: Gaussian, xi: Array, costs: Array, rng: np.random.Generator, std_floor: ArrayLike
+    rule: Update,
+    p: Gaussian,
+    start: Gaussian,
+    xi: Array,
+    costs: Array,
+    rng: np.random.Generator,
+    std_floor: ArrayLike,
 ) -> UpdateResult:
-    """What a rule makes of draws that :func:`further_out` made: of all, or of p(ξ)'s own if the best is among them.
+    """What a rule makes of such draws: those further out if they are better, and of ``start``; else p(ξ)'s own.
 
-    Where all count, its KL bound is that of the wider Gaussian.
+    Its KL bound is that of the Gaussian that the draws came from.
     """
-    if costs[OWN].min() <= costs[_FAR].min():
-        return rule(p, xi[OWN], costs[OWN], rng, std_floor)
-    step = rule(_scaled(p, _WIDTH), xi, costs, rng, std_floor=_WIDTH * np.asarray(std_floor))
-    return replace(step, distribution=_scaled(step.distribution, 1 / _WIDTH))
+    (own, far), (own_costs, far_costs) = own_and_far(xi), own_and_far(costs)
+    if not is_better_further_out(costs):
+        return rule(p, own, own_costs, rng, std_floor)
+    step = rule(_scaled(start, _FARTHER), far, far_costs, rng, std_floor=_FARTHER * np.asarray(std_floor))
+    return replace(step, distribution=_scaled(step.distribution, 1 / _FARTHER))
 
 
 def _scaled(p: Gaussian, factor: float) -> Gaussian:

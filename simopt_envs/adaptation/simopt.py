@@ -17,7 +17,13 @@ from simopt_envs.adaptation.checkpoint import Checkpoint, Content, Result, ident
 from simopt_envs.adaptation.discrepancy import Discrepancy, Verdict, judge
 from simopt_envs.adaptation.protocols import EvaluableSystem, PersistentTrainer, Policy, RealSystem, Trainer
 from simopt_envs.adaptation.records import Event, Iteration, pack_trajectories, unpack_trajectories
-from simopt_envs.adaptation.search import OWN, further_out, is_stuck, update_further_out
+from simopt_envs.adaptation.search import (
+    is_better_further_out,
+    is_stuck,
+    own_and_far,
+    sample_further_out,
+    update_further_out,
+)
 from simopt_envs.adaptation.simulator import EnvSimulator, Simulator
 from simopt_envs.adaptation.updates import REPS, Update
 from simopt_envs.distributions.gaussian import Gaussian
@@ -147,12 +153,14 @@ class SimOpt:
             before = distribution
             updates: list[Result] = []
             if measurement is not None:
+                start = before
                 for j in range(self.updates_per_iteration):
                     stuck = is_stuck([u["costs"] for u in updates], measurement.verdict.threshold)
-                    updates.append(self._update(checkpoint, k, j, distribution, policy, measurement, stuck))
-                    distribution = Gaussian.from_dict(
-                        json.loads(str(updates[-1]["distribution"])), self.distribution.space
-                    )
+                    update = self._update(checkpoint, k, j, distribution, policy, measurement, start if stuck else None)
+                    updates.append(update)
+                    distribution = Gaussian.from_dict(json.loads(str(update["distribution"])), self.distribution.space)
+                    if stuck and is_better_further_out(update["costs"]):
+                        start = distribution
             policy, training = self._train(checkpoint, k, distribution, policy)
             success = self._evaluate(checkpoint, k, policy)
             measurement = self._measure(checkpoint, k, distribution, policy)
@@ -238,7 +246,8 @@ class SimOpt:
         draws, noise = self._rngs(k, "measure")
 
         def compare() -> Content:
-            xi, costs, simulated, success = self._simulate(distribution, policy, real, draws)
+            xi = distribution.sample(self.simulated_rollouts // len(real), draws)
+            costs, simulated, success = self._simulate(distribution, xi, policy, real, draws)
             verdict = json.dumps(asdict(judge(self.discrepancy, costs, real, noise)))
             success = math.nan if success is None else success
             scalars: Content = {"sim_success": success, "verdict": verdict}
@@ -262,22 +271,27 @@ class SimOpt:
         distribution: Gaussian,
         policy: Policy | None,
         measurement: _Measurement,
-        stuck: bool,
+        stuck_since: Gaussian | None,
     ) -> Result:
-        """One step of p(ξ) towards the measured episodes, from draws further out if the steps before got stuck."""
+        """One step of p(ξ) towards the measured episodes; stuck ones also look further out from where they began."""
         draws, random, noise = self._rngs(k, "update", 3, j)
 
         def compute() -> Content:
-            xi, costs = measurement.xi, measurement.costs
+            xi, costs, own = measurement.xi, measurement.costs, measurement.costs
             if j > 0:
-                xi, costs, _, _ = self._simulate(distribution, policy, measurement.real, draws, stuck)
-            own = costs[OWN] if stuck else costs
+                n = len(xi)
+                if stuck_since is None:
+                    xi = distribution.sample(n, draws)
+                else:
+                    xi = sample_further_out(distribution, stuck_since, n, draws)
+                costs, _, _ = self._simulate(distribution, xi, policy, measurement.real, draws)
+                own = costs if stuck_since is None else own_and_far(costs)[0]
             arrived = judge(self.discrepancy, own, measurement.real, noise).label != "unexplained"
             floor = (_FLOOR_ARRIVED if arrived else _FLOOR_SEARCHING) * self.distribution.std
-            if stuck:
-                step = update_further_out(self.update, distribution, xi, costs, random, floor)
-            else:
+            if stuck_since is None:
                 step = self.update(distribution, xi, costs, random, std_floor=floor)
+            else:
+                step = update_further_out(self.update, distribution, stuck_since, xi, costs, random, floor)
             return {
                 "distribution": json.dumps(step.distribution.to_dict()),
                 "kl": step.kl,
@@ -292,22 +306,19 @@ class SimOpt:
     def _simulate(
         self,
         distribution: Gaussian,
+        xi: Array,
         policy: Policy | None,
         real: Sequence[Trajectory],
         rng: np.random.Generator,
-        stuck: bool = False,
-    ) -> tuple[Array, Array, list[Trajectory], float | None]:
-        """ξ ~ p(ξ), their costs, the episodes of the best, and the share of successes."""
-        xi = distribution.sample(self.simulated_rollouts // len(real), rng)
-        if stuck:
-            xi = further_out(distribution, xi)
+    ) -> tuple[Array, list[Trajectory], float | None]:
+        """Costs of ξ that were drawn for an update of p(ξ), the episodes of the best, and the share of successes."""
         rollouts = self.simulator.rollout(policy, distribution.space, xi, real, int(rng.integers(2**31)))
         costs = self.discrepancy(rollouts, real)
         if not np.isfinite(costs).any():
             raise RuntimeError(f"the simulation diverged for every one of {len(xi)} ξ drawn from\n{distribution}")
         best = int(np.argmin(costs))
         simulated = [rollouts.trajectory(best, i) for i in range(len(real))]
-        return xi, costs, simulated, None if rollouts.success is None else float(rollouts.success.mean())
+        return costs, simulated, None if rollouts.success is None else float(rollouts.success.mean())
 
     def _phase(
         self,
