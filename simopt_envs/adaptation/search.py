@@ -1,10 +1,10 @@
 """Drawing ξ further out than p(ξ) reaches, where its updates have come to a standstill.
 
-Contacts make costs flat or misleading near p(ξ): while every simulated peg meets the wall of the box, nothing tells
-that with a longer rope it would not, and updates go to the bottom of a valley in which nothing explains what was
+Contacts make costs flat or misleading near p(ξ): while every simulated peg drops into the hole that the real one
+misses, its rope's length changes little, and updates go to the bottom of a valley in which nothing explains what was
 measured. So half of the draws go three times as far as p(ξ) did when its updates began. Where the best of them is
-better than the best of p(ξ)'s own, p(ξ) goes on from there instead: as that wider Gaussian is updated by them, with its
-own width.
+better than the best of p(ξ)'s own, p(ξ) goes on from there instead: as that wider Gaussian is updated by them, with
+its own width.
 """
 
 from __future__ import annotations
