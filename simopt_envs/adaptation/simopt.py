@@ -277,7 +277,7 @@ class SimOpt:
         draws, random, noise = self._rngs(k, "update", 3, j)
 
         def compute() -> Content:
-            xi, costs, own = measurement.xi, measurement.costs, measurement.costs
+            xi, costs = measurement.xi, measurement.costs
             if j > 0:
                 n = len(xi)
                 if stuck_since is None:
@@ -285,7 +285,7 @@ class SimOpt:
                 else:
                     xi = sample_further_out(distribution, stuck_since, n, draws)
                 costs, _, _ = self._simulate(distribution, xi, policy, measurement.real, draws)
-                own = costs if stuck_since is None else own_and_far(costs)[0]
+            own = costs if stuck_since is None else own_and_far(costs)[0]
             arrived = judge(self.discrepancy, own, measurement.real, noise).label != "unexplained"
             floor = (_FLOOR_ARRIVED if arrived else _FLOOR_SEARCHING) * self.distribution.std
             if stuck_since is None:
