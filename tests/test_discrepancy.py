@@ -135,6 +135,7 @@ def test_quick_motion_is_not_taken_for_noise(turning, label):
     costs = np.array([0.5, 1.0]) * discrepancy.of_motion(real)
     verdict = judge(discrepancy, costs, real, rng)
     assert (verdict.label, verdict.noise == 0.0) == (label, turning), verdict
+    assert ("noise alone unknown" in str(verdict)) is turning
 
 
 @pytest.mark.parametrize(

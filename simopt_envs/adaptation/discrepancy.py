@@ -171,9 +171,10 @@ class Verdict:
     threshold: float
 
     def __str__(self) -> str:
+        noise = f"{self.noise:.3g}" if self.noise else "unknown"
         return (
             f"{self.label}: best cost {self.best:.3g}, explained up to {self.threshold:.3g}"
-            f" (noise alone {self.noise:.3g}, no motion {self.motion:.3g})"
+            f" (noise alone {noise}, no motion {self.motion:.3g})"
         )
 
 
