@@ -30,8 +30,8 @@ SHIFT = 0.15
 class Args:
     """What to measure."""
 
-    policy: Path = Path("out/cure/shift_15_seed_0/checkpoints/000_train/policy")
-    """A policy trained at the nominal cabinet: `make demo` leaves one in out/demo/checkpoints/000_train."""
+    policy: Path = Path("out/demo/checkpoints/000_train/policy")
+    """A policy trained at the nominal cabinet: `make demo` leaves one there."""
     rollouts: tuple[int, ...] = (120, 240, 480, 960, 9600)
     """Simulated rollouts of an update."""
     updates: int = 4
