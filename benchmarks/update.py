@@ -1,6 +1,6 @@
 """One update of p(ξ) from 9600 simulated rollouts, the paper's number, and from fewer.
 
-    python benchmarks/update.py --policy out/cure/shift_15_seed_0/checkpoints/000_train/policy
+    python benchmarks/update.py --policy out/demo/checkpoints/000_train/policy
 
 A policy trained at the nominal cabinet is measured three times on a system whose cabinet stands 15 cm off; p(ξ) is
 then updated a few times on these same rollouts. Shows the seconds of an update and how far the mean of cabinet_x came,
