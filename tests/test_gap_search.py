@@ -14,7 +14,7 @@ from simopt_envs.gap.hypothesis import Candidate
 from simopt_envs.gap.motion import motion_of
 from simopt_envs.gap.plain import plain_parameters
 from simopt_envs.gap.recordings import read_windows
-from simopt_envs.gap.search import Search
+from simopt_envs.gap.search import Search, _is_there
 from simopt_envs.physics.effects import EFFECTS
 
 pytestmark = needs_effects
@@ -46,7 +46,15 @@ def test_an_effect_gives_way_to_the_rival_that_explains_more_beside_the_others(d
     hidden = lambda q, v: np.array([-3.0 * q[0], -0.5 * np.tanh(v[1] / 0.01) - difference / 2])  # noqa: E731
     search = _search(hidden, (SPRING, DRY, ONE_SIDED))
     stages = [search.stage(search.base())]
-    final = search._revised(search.base((DRY, SPRING)), stages)
-    assert {*final.hypothesis.candidates} == {right, SPRING}
+    final, effects = search._revised(search.base((DRY, SPRING)), stages)
+    assert {*final.hypothesis.candidates} == {right, SPRING} == {score.candidate for score in effects}
+    assert effects[0].total > effects[1].total
     assert stages[1].base.hypothesis.candidates == (SPRING,)
     assert {score.candidate for score in stages[1].scores} == {DRY, ONE_SIDED}
+
+
+@pytest.mark.parametrize("friction", [0.5, 0.0])
+def test_an_effect_is_there_if_its_interval_leaves_out_none_of_it(friction):
+    search = _search(lambda q, v: np.array([0.0, -friction * np.tanh(v[1] / 0.01)]), (DRY,))
+    base = search.base((DRY,))
+    assert _is_there(base, DRY, base.spread(search.data)) == (friction > 0)

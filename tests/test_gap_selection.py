@@ -83,9 +83,9 @@ def test_a_simpler_law_is_as_good_where_it_takes_and_leaves_nearly_as_much(base,
 def test_errors_count_in_what_is_left_only_where_that_is_far_more_than_noise():
     rng = np.random.default_rng(0)
     noise = rng.normal(size=(8, 26, 2))
-    right: Any = SimpleNamespace(held_out=noise)
+    right: Any = SimpleNamespace(held_out=SimpleNamespace(errors=noise))
     np.testing.assert_array_equal(tolerance_of(right), 1.0)
-    astray: Any = SimpleNamespace(held_out=noise * np.array([1.0, 20.0]))
+    astray: Any = SimpleNamespace(held_out=SimpleNamespace(errors=noise * np.array([1.0, 20.0])))
     assert tolerance_of(astray) == pytest.approx([1.0, 20.0], rel=0.1)
 
 

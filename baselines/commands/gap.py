@@ -152,7 +152,7 @@ def _left(spec: mujoco.MjSpec, prior: Gaussian, recordings: Sequence[Recording],
     plain = Plain.of(spec, prior)
     data = read_windows(plain.model, recordings, _HOME)
     null = Search(plain, data, motion_of(plain.model, recordings, _HOME), (), show).base()
-    return of_median_window(null.held_out)
+    return of_median_window(null.held_out.errors)
 
 
 def told(folder: Path) -> str:

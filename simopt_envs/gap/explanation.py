@@ -35,7 +35,7 @@ class Stage:
 
 def ranked(base: Base, screened: Sequence[Screened], trials: Mapping[Candidate, Trial]) -> Stage:
     """A stage from what was screened and fitted: errors count by what the best trial makes of them."""
-    best = min(trials.values(), key=lambda t: t.fit.loss + 0.5 * np.sum((t.held_out / base.tolerance) ** 2))
+    best = min(trials.values(), key=lambda t: t.fit.loss + 0.5 * np.sum((t.held_out.errors / base.tolerance) ** 2))
     worth = worth_of(best)
     scores = [score_of(base, candidate, trial, worth) for candidate, trial in trials.items()]
     return Stage(base, tuple(screened), tuple(sorted(scores, key=lambda score: -score.total)))
@@ -53,6 +53,7 @@ class Explanation:
     Attributes:
         null: the model as given, its plain parameters refitted.
         final: with all effects that are missing; the null where there are none.
+        effects: what each of them earns beside the others, most first.
         stages: one for each effect that was added, the one that added none, and those that compared an effect with its
             rivals beside the others.
         data: the windows that were fitted.
@@ -60,10 +61,6 @@ class Explanation:
 
     null: Base
     final: Base
+    effects: tuple[Score, ...]
     stages: tuple[Stage, ...]
     data: Data
-
-    @property
-    def effects(self) -> tuple[Candidate, ...]:
-        """What is missing."""
-        return self.final.hypothesis.candidates

@@ -18,7 +18,6 @@ from simopt_envs.gap.describe import describe
 from simopt_envs.gap.error import held_out_errors
 from simopt_envs.gap.explanation import Explanation
 from simopt_envs.gap.fit import Misfit
-from simopt_envs.gap.foreseen import unforeseen
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
 from simopt_envs.gap.localise import localise
 from simopt_envs.gap.motion import motion_of
@@ -108,23 +107,21 @@ def _silent_warnings() -> Iterator[None]:
 
 def _gap(given: mujoco.MjSpec, explanation: Explanation, short: Data, keyframe: str | None, began: float) -> Gap:
     """What was found; where the model errs, and on what that depends, is told from short windows in any case."""
-    null, final = explanation.null, explanation.final
-    beyond = unforeseen(final, explanation.data.held_out)
-    verdict = judge(explanation, beyond)
-    if verdict == "unexplained":
-        final = null
+    verdict = judge(explanation)
+    null, unforeseen = explanation.null, explanation.final.unforeseen
+    explained = explanation if verdict != "unexplained" else replace(explanation, final=null, effects=())
+    final = explained.final
     as_given = null.hypothesis.space.nominal
     fitted = [base.hypothesis.xi(base.fit.u[None])[0] for base in (null, final)]
     models = [(null.hypothesis, as_given), (null.hypothesis, fitted[0]), (final.hypothesis, fitted[1])]
     errors = held_out_errors(explanation.data.held_out, models, null.sensor_noise, np.random.default_rng(_SEED))
-    explained = replace(explanation, final=final)
     spec, diff = repair(explained, given, fitted[1])
     rows = localise(short.held_out, _left_by(null, short.held_out).errors, null.hypothesis.plain.model)
     residuals = [_left_by(final, windows) for windows in (short.fitted, short.held_out)]
     left = describe(final.hypothesis, final.fit.u, residuals)
     named = separate(named_effects(explained), explained, keyframe)
     seconds = time.perf_counter() - began
-    return Gap(verdict, named, errors, rows, left, explained, beyond, spec, diff, seconds)
+    return Gap(verdict, named, errors, rows, left, explained, unforeseen, spec, diff, seconds)
 
 
 def _left_by(base: Base, windows: Windows) -> Residual:

@@ -9,6 +9,7 @@ import numpy as np
 from simopt_envs.adaptation.checkpoint import Result
 from simopt_envs.gap.fit import DIFFERENCES, Fit, Misfit, fit
 from simopt_envs.gap.large import of_some_size
+from simopt_envs.gap.predictive import HeldOut
 from simopt_envs.gap.trial import Base, Screened
 from simopt_envs.measured.windows import Windows
 from simopt_envs.physics.parameters import Array
@@ -60,7 +61,9 @@ def fitted(refit: Refit, base: Base, windows: Windows, held_out: Windows, num_th
     else:
         found = fit(misfit, refit.near, ITERATIONS, differences=DIFFERENCES[1:])
     test = Misfit(hypothesis, held_out, num_threads).with_noise(base.held_out_noise)
-    return {**vars(found), "held_out": base.tolerance * test.errors(found.u[None])[0]}
+    known = base.held_out.jacobian if refit.near is None else None
+    told = HeldOut.of(test, found.u, base.tolerance, known)
+    return {**vars(found), "held_out": told.errors, "held_out_jacobian": told.jacobian}
 
 
 def _fitted_from(misfit: Misfit, starts: Array, known: Array) -> Fit:

@@ -15,11 +15,10 @@ from simopt_envs.gap.confusion import Partner, commands_file, partners
 from simopt_envs.gap.describe import Description
 from simopt_envs.gap.error import Errors
 from simopt_envs.gap.explanation import Explanation
-from simopt_envs.gap.fit import DIFFERENCES, Misfit
 from simopt_envs.gap.hypothesis import Candidate
 from simopt_envs.gap.localise import Row
 from simopt_envs.gap.repair import column_lines, difference, repaired
-from simopt_envs.gap.thresholds import EXPLAINED, LEAST_SHARE
+from simopt_envs.gap.thresholds import CONFIDENT, EXPLAINED, LEAST_SHARE
 from simopt_envs.gap.trial import Data
 from simopt_envs.measured.recording import Finding
 from simopt_envs.physics.effects import object_name
@@ -27,7 +26,6 @@ from simopt_envs.physics.effects.actuators import driven_joint
 from simopt_envs.physics.parameters import Array
 
 Verdict = Literal["named", "partly", "none", "unexplained"]
-_NORMAL_95 = 1.96
 
 
 @dataclass(frozen=True)
@@ -50,7 +48,7 @@ class Named:
     Attributes:
         candidate: the effect and its place.
         parameters: its numbers by their short names.
-        evidence: nats that it earned, ``"fitted"`` and ``"held_out"``.
+        evidence: nats that it earns beside the others, ``"fitted"`` and ``"held_out"``.
         partners: effects that these data hardly tell from it.
     """
 
@@ -70,12 +68,12 @@ class Gap:
 
     Attributes:
         verdict: ``"named"``, ``"partly"``, ``"none"`` or ``"unexplained"``.
-        effects: what is missing.
+        effects: what is missing, most evidence first.
         errors: on recordings that no fit saw.
         localisation: where the refitted model and the recordings disagree, largest share first.
         left: what the part that is not explained depends on.
         explanation: the search behind it.
-        unforeseen: what the verdict is on, see :mod:`simopt_envs.gap.foreseen`.
+        unforeseen: what the verdict is on, see :attr:`simopt_envs.gap.trial.Base.unforeseen`.
         spec: the repaired model.
         diff: its difference to the model as given.
         seconds: that it took.
@@ -212,14 +210,9 @@ def _motion(effect: Candidate, partner: Partner) -> dict[str, Any] | None:
     }
 
 
-def judge(explanation: Explanation, unforeseen: float) -> Verdict:
-    """The verdict on a search, from what is left on recordings that no fit saw.
-
-    Args:
-        explanation: the search.
-        unforeseen: of its final model, see :mod:`simopt_envs.gap.foreseen`.
-    """
-    right = unforeseen < EXPLAINED - 1
+def judge(explanation: Explanation) -> Verdict:
+    """The verdict on a search, from what is left on recordings that no fit saw."""
+    right = explanation.final.unforeseen < EXPLAINED - 1
     if not explanation.effects:
         return "none" if right else "unexplained"
     if right:
@@ -232,26 +225,22 @@ def named_effects(explanation: Explanation) -> tuple[Named, ...]:
     """The effects that a search found, with what it knows of their numbers."""
     final = explanation.final
     hypothesis, u = final.hypothesis, final.fit.u
-    mean_square = float(np.mean((final.held_out / final.tolerance) ** 2))
-    misfit = Misfit(hypothesis, explanation.data.fitted).with_noise(final.noise)
-    other = misfit.jacobian(u, difference=DIFFERENCES[1])
-    spread = np.sqrt(final.fit.variance(other, max(1.0, mean_square), explanation.data.parts))
-    ends = u + _NORMAL_95 * np.array([-spread, spread])
+    spread = final.spread(explanation.data)
+    ends = u + CONFIDENT * np.array([-spread, spread])
     xi, (low, high) = hypothesis.xi(u[None])[0], hypothesis.xi(ends)
-    scores = {score.candidate: score for stage in explanation.stages for score in stage.scores}
     return tuple(
         Named(
-            candidate,
+            score.candidate,
             {
-                hypothesis.space.names[i].removeprefix(candidate.full_name("")): Estimate(
+                hypothesis.space.names[i].removeprefix(score.candidate.full_name("")): Estimate(
                     float(xi[i]), hypothesis.space.units[i], (float(low[i]), float(high[i]))
                 )
-                for i in columns
+                for i in hypothesis.columns[score.candidate]
             },
-            {"fitted": scores[candidate].fitted, "held_out": scores[candidate].held_out},
-            partners(explanation, candidate),
+            {"fitted": score.fitted, "held_out": score.held_out},
+            partners(explanation, score.candidate),
         )
-        for candidate, columns in hypothesis.columns.items()
+        for score in explanation.effects
     )
 
 

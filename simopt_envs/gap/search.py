@@ -18,11 +18,13 @@ from simopt_envs.gap.hypothesis import Candidate, Hypothesis
 from simopt_envs.gap.kept import kept_fits, key_of
 from simopt_envs.gap.large import nearest_size, of_several_effects
 from simopt_envs.gap.plain import SPEAKS_FOR, Plain
+from simopt_envs.gap.predictive import HeldOut
 from simopt_envs.gap.recordings import without_wild_starts
 from simopt_envs.gap.refit import ITERATIONS, Refit, fitted
-from simopt_envs.gap.selection import chosen, score_of, tolerance_of, worth_of
+from simopt_envs.gap.selection import Score, chosen, score_of, tolerance_of, worth_of
 from simopt_envs.gap.thresholds import (
     BENT,
+    CONFIDENT,
     EVIDENCE,
     FAR,
     FORGOTTEN,
@@ -111,8 +113,8 @@ class Search:
                 break
             stages.append(self._polished(self.stage(base)))
             base = stages[-1].base
-        final = self._revised(base, stages)
-        return Explanation(null, final, tuple(stages), self.data)
+        final, effects = self._revised(base, stages)
+        return Explanation(null, final, effects, tuple(stages), self.data)
 
     @staticmethod
     def _predicts(base: Base, longer: Data) -> bool:
@@ -167,8 +169,8 @@ class Search:
         scale = self._floor * self._tolerance
         noise, held_out_noise = fitted.noise_at(u, scale), held_out.noise_at(u, scale)
         found = self._fit(fitted.with_noise(noise), u, differences)
-        errors = self._tolerance * held_out.with_noise(held_out_noise).errors(found.u[None])[0]
-        return Base(hypothesis, found, errors, noise, held_out_noise, self._tolerance)
+        told = HeldOut.of(held_out.with_noise(held_out_noise), found.u, self._tolerance)
+        return Base(hypothesis, found, told, noise, held_out_noise, self._tolerance)
 
     def _sharpened(self, trial: Trial) -> Base:
         """A trial's hypothesis as a base: fitted to the sensors' noise or, where that leaves far more, to what is left.
@@ -188,9 +190,11 @@ class Search:
         spoken_for = self._spoken_for(base)
         wanted = [*spoken_for, *self._large(base, screened)]
         promising = screened[:REFITTED] + [s for s in screened[REFITTED:] if s.candidate in wanted]
-        everywhere = (_afresh(base),) if base.excess > LARGE else ()
-        far = {candidate: (start, *everywhere) for candidate, start in spoken_for.items()}
-        trials = self.trials(base, [Refit(one, far.get(one.candidate, everywhere)) for one in promising])
+        far: dict[Candidate, tuple[Array, ...]] = {candidate: (start,) for candidate, start in spoken_for.items()}
+        for candidate in (one.candidate for one in promising):
+            if base.excess > LARGE or (base.strained and candidate.effect.name in SPEAKS_FOR.values()):
+                far[candidate] = (*far.get(candidate, ()), _afresh(base))
+        trials = self.trials(base, [Refit(one, far.get(one.candidate, ())) for one in promising])
         return ranked(base, screened, self._in_full(base, screened, trials))
 
     def _screened(self, base: Base) -> list[Screened]:
@@ -295,7 +299,7 @@ class Search:
         trials = {}
         for i, (key, refit) in enumerate(zip(keys, refits, strict=True)):
             arrays = self._kept.phase(key, partial(found.__getitem__, i))
-            held_out = arrays.pop("held_out")
+            held_out = HeldOut(arrays.pop("held_out"), arrays.pop("held_out_jacobian"))
             trials[refit.screened.candidate] = Trial(refit.screened.hypothesis, Fit(**arrays), held_out)
         return trials
 
@@ -321,18 +325,27 @@ class Search:
                     starts.setdefault(c, base.fit.u.copy())[i] = 0.0
         return starts
 
-    def _revised(self, base: Base, stages: list[Stage], dropped: frozenset[Candidate] = frozenset()) -> Base:
+    def _revised(
+        self, base: Base, stages: list[Stage], dropped: frozenset[Candidate] = frozenset()
+    ) -> tuple[Base, tuple[Score, ...]]:
         """Without the effects that the others have made needless, and with rivals that do more beside them instead.
 
-        With and without are compared in one noise, that of the model with all: what uncertain starts leave depends on
-        the model too. What was dropped does not come back.
+        With it comes what each earns, most first. With and without are compared in one noise, that of the model with
+        all: what uncertain starts leave depends on the model too. An effect whose interval holds "none of it" goes as
+        well: the evidence for it is of a few stretches, and others speak against it. What was dropped does not come
+        back.
         """
-        effects = base.hypothesis.candidates
-        for effect in effects if len(effects) > 1 else ():
-            without = self._without(base, effect)
-            if not score_of(without, effect, base, worth_of(base)).earned:
+        effects, earned = base.hypothesis.candidates, []
+        if not effects:
+            return base, ()
+        spread = base.spread(self.data)
+        for effect in effects:
+            without = self._without(base, effect, stages)
+            score = score_of(without, effect, base, worth_of(base))
+            if not (score.earned and _is_there(base, effect, spread)):
                 return self._revised(self.base(without.hypothesis.candidates, without.fit.u), stages, dropped)
-            rivals = stage_of(stages, effect).rivals(effect) - dropped - {*effects}
+            earned.append(score)
+            rivals = stage_of(stages, effect).rivals(effect) - dropped - {*effects} if len(effects) > 1 else ()
             if not rivals:
                 continue
             screened = self._screened(without)
@@ -341,21 +354,30 @@ class Search:
             best = chosen(stages[0].base, without, stages[-1].scores)
             if best is not None and best.candidate != effect:
                 return self._revised(self._sharpened(best.trial), stages, dropped | {effect})
-        return base
+        return base, tuple(sorted(earned, key=lambda score: -score.total))
 
-    def _without(self, base: Base, effect: Candidate) -> Base:
+    def _without(self, base: Base, effect: Candidate, stages: Sequence[Stage]) -> Base:
         """A base without one of its effects, in its noise."""
-        hypothesis = Hypothesis(self.plain, [e for e in base.hypothesis.candidates if e != effect], self.motion)
+        left = tuple(e for e in base.hypothesis.candidates if e != effect)
+        hypothesis = Hypothesis(self.plain, left, self.motion)
         misfit, test = (Misfit(hypothesis, windows) for windows in (self.data.fitted, self.data.held_out))
-        start = base.hypothesis.without(effect, base.fit.u)
-        found = self._fit(misfit.with_noise(base.noise), start, DIFFERENCES[1:])
-        errors = base.tolerance * test.with_noise(base.held_out_noise).errors(found.u[None])[0]
-        return Base(hypothesis, found, errors, base.noise, base.held_out_noise, base.tolerance)
+        misfit = misfit.with_noise(base.noise)
+        before = [stage.base.fit.u for stage in stages if stage.base.hypothesis.candidates == left]
+        start = misfit.best(np.array([base.hypothesis.without(effect, base.fit.u), *before]))
+        found = self._fit(misfit, start, DIFFERENCES[1:])
+        told = HeldOut.of(test.with_noise(base.held_out_noise), found.u, base.tolerance)
+        return Base(hypothesis, found, told, base.noise, base.held_out_noise, base.tolerance)
 
 
 def _afresh(trial: Trial) -> Array:
     """A trial's coordinates (d,), its plain parameters at their priors' means."""
     return np.where(np.arange(len(trial.fit.u)) < trial.hypothesis.num_plain, 0.0, trial.fit.u)
+
+
+def _is_there(base: Base, effect: Candidate, spread: Array) -> bool:
+    """Whether an effect's interval leaves out that there is none of it."""
+    off = np.abs(base.fit.u - base.hypothesis.neutral()) > CONFIDENT * spread
+    return bool(np.any(off[base.hypothesis.amounts(effect)]))
 
 
 def _clipped(step: float, shift: Array, neutral: Array, hypothesis: Hypothesis, columns: list[int]) -> float:

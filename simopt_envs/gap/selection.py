@@ -33,7 +33,7 @@ class Score:
         candidate: the effect and its place.
         trial: its fit.
         fitted: gain on the fitted windows and the prior, less the price of its parameters (BIC).
-        held_out: gain on the windows held out and the prior.
+        held_out: gain on the windows held out, as far as those fitted foretell them, and the prior.
         of_prior: the part of both that plain parameters give back, as they need not stand in for the effect any more.
     """
 
@@ -107,7 +107,7 @@ def worth_of(best: Trial) -> Array:
 
     Where it leaves more, the errors are larger than the noise and go together within a window: that many fewer count.
     """
-    errors = best.held_out
+    errors = best.held_out.errors
     mean_square = np.mean(errors**2, axis=(0, 1))
     of_means = np.mean(errors.mean(axis=1) ** 2, axis=0)
     alike = np.clip(errors.shape[1] * of_means / np.maximum(mean_square, 1e-12), 1.0, errors.shape[1])
@@ -119,7 +119,7 @@ def tolerance_of(best: Trial) -> Array:
 
     That is 1 or, where even the best model leaves far more in some channel, what it leaves, by what that is worth.
     """
-    coarse = np.sqrt(np.mean(best.held_out**2, axis=(0, 1))) > COARSE
+    coarse = np.sqrt(np.mean(best.held_out.errors**2, axis=(0, 1))) > COARSE
     return 1 / np.sqrt(worth_of(best)) if coarse.any() else np.ones(len(coarse))
 
 
@@ -136,5 +136,7 @@ def score_of(base: Base, candidate: Candidate, trial: Trial, worth: Array) -> Sc
     price = 0.5 * added * np.log(base.fit.errors.size)
     of_prior = prior(base.fit) - prior(trial.fit)
     fitted = gain(base.tolerance * base.fit.errors, base.tolerance * trial.fit.errors) + of_prior - price
-    held_out = gain(base.held_out, trial.held_out) + of_prior
+    weight = worth * base.tolerance**2
+    before, after = (t.held_out.surprise(t.precision(weight), worth) for t in (base, trial))
+    held_out = before - after + of_prior
     return Score(candidate, trial, float(fitted), float(held_out), of_prior)

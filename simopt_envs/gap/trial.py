@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import chi2
 
 from simopt_envs.adaptation.fitting import Noise
-from simopt_envs.gap.fit import Fit
+from simopt_envs.gap.fit import DIFFERENCES, Fit, Misfit
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
-from simopt_envs.gap.thresholds import WINDOW
+from simopt_envs.gap.predictive import HeldOut, precision
+from simopt_envs.gap.thresholds import EXPLAINED, FAR, WINDOW
 from simopt_envs.measured.recording import Finding, Recording
 from simopt_envs.measured.windows import Windows
 from simopt_envs.physics.parameters import Array
@@ -49,17 +51,21 @@ class Trial:
     Attributes:
         hypothesis: plain parameters and effects.
         fit: of the fitted windows.
-        held_out: whitened errors there, in units of the sensors' noise, (w, S, c).
+        held_out: its errors there.
     """
 
     hypothesis: Hypothesis
     fit: Fit
-    held_out: Array
+    held_out: HeldOut
+
+    def precision(self, weight: Array) -> Array:
+        """Of u by the windows fitted, (d, d), each channel's squared errors counted by a weight, (c,)."""
+        return precision(self.fit, self.hypothesis.high - self.hypothesis.low, weight)
 
     @property
     def excess(self) -> float:
         """Mean square of the whitened held-out errors above that of noise alone, which is 1."""
-        return float(np.mean(self.held_out**2)) - 1.0
+        return float(np.mean(self.held_out.errors**2)) - 1.0
 
 
 def of_median_window(errors: Array) -> float:
@@ -85,6 +91,31 @@ class Base(Trial):
     def sensor_noise(self) -> Array:
         """Standard deviation of each channel's noise, (c,)."""
         return self.noise.scale / self.tolerance
+
+    @property
+    def strained(self) -> bool:
+        """Whether its plain parameters, all together, are as improbable as one alone that speaks for an effect."""
+        plain = self.fit.u[: self.hypothesis.num_plain]
+        return bool(chi2.sf(plain @ plain, len(plain)) < chi2.sf(FAR**2, 1))
+
+    @property
+    def unforeseen(self) -> float:
+        """The excess in units of the predictive distribution, to first order; the verdict is on it.
+
+        It is the excess itself where the model does not fit what was fitted either, or where errors are counted in more
+        than the sensors' noise: that no parameter's uncertainty excuses.
+        """
+        if np.any(self.tolerance > 1) or np.mean(self.fit.errors**2) > EXPLAINED:
+            return self.excess
+        every = np.ones(len(self.tolerance))
+        return self.excess - self.held_out.excused(self.precision(every)) / self.held_out.errors.size
+
+    def spread(self, data: Data) -> Array:
+        """Standard deviation of u, (d,), by the windows that were fitted."""
+        mean_square = float(np.mean((self.held_out.errors / self.tolerance) ** 2))
+        misfit = Misfit(self.hypothesis, data.fitted).with_noise(self.noise)
+        other = misfit.jacobian(self.fit.u, difference=DIFFERENCES[1])
+        return np.sqrt(self.fit.variance(other, max(1.0, mean_square), data.parts))
 
 
 @dataclass(frozen=True)
