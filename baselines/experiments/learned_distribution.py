@@ -87,15 +87,15 @@ def _figure(results: Results) -> Figure:
         for run in runs:
             steps, reached = np.array([(s, np.nan if y is None else y) for s, y in run["curve"]]).T
             look = style(index) | {"marker": ""}
-            curves.plot(steps / EPISODE_STEPS, reached, **look, label=f"{task}, {name}" if run is runs[0] else "")
+            curves.plot(steps / EPISODE_STEPS / 1000, reached, **look, label=f"{task}, {name}" if run is runs[0] else "")
     for task in FIXED:
         for target in FAR[task]:
             for name in _settings(task):
                 estimate = _success(_runs(results, task, name), target)
                 if estimate:
                     rows[f"{task}, {target}: {name}"] = estimate
-    curves.set(title="Success under the training's own p(ξ)", xlabel="episodes of training", xscale="log")
-    curves.legend()
+    curves.set(title="Success under the training's own p(ξ)", xlabel="thousand episodes of training")
+    curves.legend(loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=2)
     success.set(title="Success on the target after training")
     draw_points(success, rows)
     as_percent(curves)
