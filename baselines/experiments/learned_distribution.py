@@ -87,7 +87,9 @@ def _figure(results: Results) -> Figure:
         for run in runs:
             steps, reached = np.array([(s, np.nan if y is None else y) for s, y in run["curve"]]).T
             look = style(index) | {"marker": ""}
-            curves.plot(steps / EPISODE_STEPS / 1000, reached, **look, label=f"{task}, {name}" if run is runs[0] else "")
+            curves.plot(
+                steps / EPISODE_STEPS / 1000, reached, **look, label=f"{task}, {name}" if run is runs[0] else ""
+            )
     for task in FIXED:
         for target in FAR[task]:
             for name in _settings(task):
