@@ -34,7 +34,6 @@ HIDDEN: tuple[Mapping[str, Any], ...] = (
 _NOISE = 0.002  # rad, m
 _ROLLOUTS = 6  # measured per iteration
 _ENOUGH = 0.9
-_NORMAL_95 = 1.96
 _LEAST_STD = 0.02  # of a new parameter's value
 
 
@@ -124,6 +123,8 @@ class GapDemo:
 
 def _joined(prior: Gaussian, space: ParameterSpace, effects: list[dict[str, Any]]) -> Gaussian:
     """p(ξ) with the parameters of the effects that the space has, as sure of them as the gap workflow is."""
+    from simopt_envs.gap.thresholds import CONFIDENT  # only where the workflow has run
+
     ends = {
         full_name: fitted["interval95"]
         for entry in effects
@@ -133,6 +134,6 @@ def _joined(prior: Gaussian, space: ParameterSpace, effects: list[dict[str, Any]
     added = space.subset(list(ends))
     low, high = (added.to_unconstrained(np.clip(end, added.low, added.high)) for end in np.transpose([*ends.values()]))
     mean = added.to_unconstrained(added.nominal)
-    std = np.maximum((high - low) / (2 * _NORMAL_95), _LEAST_STD * np.where(added.is_log, 1.0, np.abs(mean)))
+    std = np.maximum((high - low) / (2 * CONFIDENT), _LEAST_STD * np.where(added.is_log, 1.0, np.abs(mean)))
     covariance = np.diag(np.append(prior.std, std) ** 2)
     return Gaussian(space.subset([*prior.space.names, *added.names]), np.append(prior.mean, mean), covariance)
