@@ -35,9 +35,13 @@ Law = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """(positions, velocities) -> generalised forces that the model knows nothing of."""
 
 
-def record(law: Law, rng: np.random.Generator, count: int = 4, seconds: float = 2.0) -> list[Recording]:
-    """Recordings of the arm with a hidden law, in random sums of sines."""
+def record(
+    law: Law, rng: np.random.Generator, count: int = 4, seconds: float = 2.0, limit: float | None = None
+) -> list[Recording]:
+    """Recordings of the arm with a hidden law, or limit of the elbow's drive [N m], in random sums of sines."""
     model = mujoco.MjModel.from_xml_string(MODEL)
+    if limit is not None:
+        model.actuator_forcelimited[1], model.actuator_forcerange[1] = True, (-limit, limit)
     model.opt.timestep, model.opt.integrator = _STEP, mujoco.mjtIntegrator.mjINT_EULER
     for field in (model.body_mass, model.body_inertia, model.dof_damping, model.dof_armature):
         field *= np.exp(0.05 * rng.standard_normal(field.shape))

@@ -10,7 +10,7 @@ import pytest
 from conftest import needs_effects
 from gap_plant import MODEL, Law, record
 
-from simopt_envs.gap.hypothesis import Candidate
+from simopt_envs.gap.hypothesis import Candidate, Hypothesis
 from simopt_envs.gap.motion import motion_of
 from simopt_envs.gap.plain import plain_parameters
 from simopt_envs.gap.recordings import read_windows
@@ -22,12 +22,13 @@ pytestmark = needs_effects
 SPRING = Candidate(EFFECTS["joint_spring"], "joint:shoulder")
 DRY = Candidate(EFFECTS["coulomb_friction"], "joint:elbow")
 COGGING = Candidate(EFFECTS["cogging"], "joint:elbow")
+LIMIT = Candidate(EFFECTS["actuator_saturation"], "actuator:elbow")
 ONE_SIDED = Candidate(EFFECTS["asymmetric_friction"], "joint:elbow")
 
 
-def _search(forces: Law, candidates: Sequence[Candidate]) -> Search:
+def _search(forces: Law, candidates: Sequence[Candidate], limit: float | None = None) -> Search:
     plain = plain_parameters(mujoco.MjSpec.from_string(MODEL))
-    recordings = record(forces, np.random.default_rng(0))
+    recordings = record(forces, np.random.default_rng(0), limit=limit)
     return Search(plain, read_windows(plain.model, recordings), motion_of(plain.model, recordings), candidates)
 
 
@@ -58,3 +59,14 @@ def test_an_effect_is_there_if_its_interval_leaves_out_none_of_it(friction):
     search = _search(lambda q, v: np.array([0.0, -friction * np.tanh(v[1] / 0.01)]), (DRY,))
     base = search.base((DRY,))
     assert _is_there(base, DRY, base.spread(search.data)) == (friction > 0)
+
+
+@pytest.mark.parametrize("limit", [1.2, 5.0])
+def test_a_limit_is_there_where_it_acts(limit):
+    """Of a limit, unlike a friction, there is no amount that could be none; the elbow's drive gives 3 N m at most."""
+    search = _search(lambda q, v: np.zeros(2), (LIMIT,), limit)
+    hypothesis = Hypothesis(search.plain, (LIMIT,), search.motion)
+    start = hypothesis.coordinates(hypothesis.space.values({LIMIT.full_name("limit"): limit}))
+    start[: hypothesis.num_plain] = 0.0
+    base = search.base((LIMIT,), start)
+    assert _is_there(base, LIMIT, base.spread(search.data)) == (limit < 3)

@@ -9,7 +9,7 @@ import pytest
 from conftest import needs_effects
 
 from benchmarks.hidden_effects import laws
-from benchmarks.hidden_effects.cases import FIRST_SEED, LEVELS, Case, Hidden, cases, table
+from benchmarks.hidden_effects.cases import FIRST_SEED, LEVELS, Case, Hidden, _double, cases, table
 from benchmarks.hidden_effects.catalogue import EFFECTS
 from benchmarks.hidden_effects.detectability import Observability, reduced
 from benchmarks.hidden_effects.generate import column_names, simulate, write_case
@@ -157,6 +157,13 @@ def test_the_splits_have_every_effect_twice_and_no_seed_in_common():
     assert {*EFFECTS} - tasks == {"contact_friction", "joint_coupling"}  # which have no place there
     with pytest.raises(ValueError, match="no such plants: three_link"):
         cases("dev", ("three_link",))
+
+
+def test_a_joint_has_one_transmission():
+    """Of this seed the first two drawn are its elasticity and its play."""
+    hidden = {(h.effect, h.place) for h in _double(9305, "two_link").hidden}
+    assert len(hidden) == 2
+    assert not {("backlash", "joint:shoulder"), ("joint_elasticity", "joint:shoulder")} <= hidden
 
 
 def answer(kind, hidden, verdict, named, value=1.0):

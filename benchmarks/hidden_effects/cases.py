@@ -23,6 +23,7 @@ FIRST_SEED = {"dev": 0, "test": 10000}
 changed again, so they count as seen (those from 9000 on with commit 4c06d5e); none from 10000 on has been run."""
 LEVELS = (10.0, 3.0)
 """Magnitudes of single effects, in least detectable ones."""
+_OF_TRANSMISSION = {"backlash", "joint_elasticity"}  # a joint has one, which the law of either replaces
 
 
 @dataclass(frozen=True)
@@ -159,5 +160,8 @@ def _double(seed: int, plant: str) -> Case:
             options = [h for h in _options(plant, effect, same_form, LEVELS[0]) if not h.capped]
             if options:
                 chosen.append(options[rng.integers(len(options))])
-        if len(chosen) == 2 and f"{chosen[1].effect}@{chosen[1].place}" not in _entry(plant, chosen[0])["alike"]:  # type: ignore[operator]
+        one_joint = len({h.place for h in chosen}) == 1
+        if len(chosen) < 2 or (one_joint and {h.effect for h in chosen} == _OF_TRANSMISSION):
+            continue
+        if f"{chosen[1].effect}@{chosen[1].place}" not in _entry(plant, chosen[0])["alike"]:  # type: ignore[operator]
             return Case(seed, plant, "double", tuple(chosen))

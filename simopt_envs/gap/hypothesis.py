@@ -46,7 +46,8 @@ class Hypothesis:
     """A model with some effects: plain parameters first in ξ, then those of each effect.
 
     A fit's coordinates u are 0 at the prior's mean and count its standard deviations; an effect's parameters count the
-    probes of their sizes instead, from the value that leaves the model as it was.
+    probes of their sizes instead, from the value that leaves the model as it was, and those of its shape the steps from
+    one probe's to the next.
 
     Args:
         plain: the model and its plain parameters.
@@ -82,6 +83,9 @@ class Hypothesis:
             z = np.array([self.space.to_unconstrained(self._probe(candidate, p)) for p in self._probes(candidate)])
             size = np.abs(z - nominal).max(axis=0)[columns]
             self._unit[columns] = np.where(size > 0, size, 1.0)
+            for i in set(columns) - set(self.amounts(candidate)):
+                if len(tried := np.unique(z[:, i])) > 1:
+                    self._unit[i] = np.median(np.diff(tried))
         self.prior_std = np.full(len(nominal), _FREE)
         self.prior_std[: self.num_plain] = 1.0
         self.low, self.high = (self.coordinates(bound) for bound in (self.space.low, self.space.high))

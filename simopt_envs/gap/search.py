@@ -25,7 +25,6 @@ from simopt_envs.gap.selection import Score, chosen, score_of, tolerance_of, wor
 from simopt_envs.gap.thresholds import (
     BENT,
     CONFIDENT,
-    EVIDENCE,
     FAR,
     FORGOTTEN,
     LARGE,
@@ -277,9 +276,12 @@ class Search:
     def _in_full(
         self, base: Base, screened: Sequence[Screened], trials: dict[Candidate, Trial]
     ) -> dict[Candidate, Trial]:
-        """Trials with the best of them fitted further: the base's derivatives mislead where an effect is large."""
-        best = {s.candidate for s in ranked(base, screened, trials).scores[:_FITTED_IN_FULL] if s.total > EVIDENCE}
-        refits = [Refit(s, near=trials[s.candidate].fit.u) for s in screened if s.candidate in best]
+        """Trials with the best of them, and the screen's first, fitted further.
+
+        With the base's derivatives a fit may end halfway, and so hide what an effect earns.
+        """
+        best = [s.candidate for s in ranked(base, screened, trials).scores[:_FITTED_IN_FULL]]
+        refits = [Refit(s, near=trials[s.candidate].fit.u) for s in screened if s.candidate in best or s is screened[0]]
         return trials | self.trials(base, refits)
 
     def trials(self, base: Base, refits: Sequence[Refit]) -> dict[Candidate, Trial]:
@@ -375,9 +377,10 @@ def _afresh(trial: Trial) -> Array:
 
 
 def _is_there(base: Base, effect: Candidate, spread: Array) -> bool:
-    """Whether an effect's interval leaves out that there is none of it."""
-    off = np.abs(base.fit.u - base.hypothesis.neutral()) > CONFIDENT * spread
-    return bool(np.any(off[base.hypothesis.amounts(effect)]))
+    """Whether an effect's interval leaves out that there is none of it: of a limit, which has no amount, that it is."""
+    hypothesis = base.hypothesis
+    off = np.abs(base.fit.u - hypothesis.neutral()) > CONFIDENT * spread
+    return bool(np.any(off[hypothesis.amounts(effect) or hypothesis.columns[effect]]))
 
 
 def _clipped(step: float, shift: Array, neutral: Array, hypothesis: Hypothesis, columns: list[int]) -> float:

@@ -19,7 +19,7 @@ from simopt_envs.physics.effects.joints import (
 from simopt_envs.physics.parameters import Parameter, Write
 
 _PERIODS = 0.7 * np.arange(1, 9)  # in the range of the motion: near enough for a fit to find those between
-_PHASES = (0.0, np.pi / 2)
+_PHASES = np.pi / 3 * np.arange(3)  # amplitudes below 0 are those between
 
 
 class Cogging(Effect):
@@ -53,13 +53,13 @@ class Cogging(Effect):
         )
 
     def probes(self, model: mujoco.MjModel, place: str, motion: Motion) -> tuple[dict[str, float], ...]:
-        """Sines and cosines with several numbers of periods in the range of the motion."""
+        """Waves of several phases and numbers of periods in the range of the motion."""
         joint = object_name(place)
         i = dof(model, joint)
         base = 2 * np.pi / float(motion.high[i] - motion.low[i])
         force = probe_force(model, joint, motion)
         return tuple(
-            {"amplitude": force, "periods": float(k) * base, "phase": phase}
+            {"amplitude": force, "periods": float(k) * base, "phase": float(phase)}
             for k, phase in itertools.product(_PERIODS, _PHASES)
         )
 
