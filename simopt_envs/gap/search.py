@@ -276,12 +276,13 @@ class Search:
     def _in_full(
         self, base: Base, screened: Sequence[Screened], trials: dict[Candidate, Trial]
     ) -> dict[Candidate, Trial]:
-        """Trials with the best of them, and the screen's first, fitted further.
+        """Trials with the best of them, and the one that the screen has first, fitted further.
 
         With the base's derivatives a fit may end halfway, and so hide what an effect earns.
         """
         best = [s.candidate for s in ranked(base, screened, trials).scores[:_FITTED_IN_FULL]]
-        refits = [Refit(s, near=trials[s.candidate].fit.u) for s in screened if s.candidate in best or s is screened[0]]
+        first = next((s.candidate for s in screened if s.candidate in trials), None)
+        refits = [Refit(s, near=trials[s.candidate].fit.u) for s in screened if s.candidate in {*best, first}]
         return trials | self.trials(base, refits)
 
     def trials(self, base: Base, refits: Sequence[Refit]) -> dict[Candidate, Trial]:
