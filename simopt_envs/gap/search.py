@@ -25,6 +25,8 @@ from simopt_envs.gap.selection import Score, chosen, score_of, tolerance_of, wor
 from simopt_envs.gap.thresholds import (
     BENT,
     CONFIDENT,
+    EVIDENCE,
+    EVIDENCE_EACH,
     FAR,
     FORGOTTEN,
     LARGE,
@@ -32,6 +34,7 @@ from simopt_envs.gap.thresholds import (
     MOST_EFFECTS,
     OUTLYING,
     REFITTED,
+    REFITTED_AT_MOST,
 )
 from simopt_envs.gap.trial import Base, Data, Screened, Trial, of_median_window
 from simopt_envs.physics.effects import Motion
@@ -188,7 +191,9 @@ class Search:
         screened = self._screened(base)
         spoken_for = self._spoken_for(base)
         wanted = [*spoken_for, *self._large(base, screened)]
-        promising = screened[:REFITTED] + [s for s in screened[REFITTED:] if s.candidate in wanted]
+        likely = [s for s in screened[:REFITTED_AT_MOST] if s.gain > EVIDENCE_EACH]
+        first = max(REFITTED, len(likely))  # of the screen, whose gains fall
+        promising = screened[:first] + [s for s in screened[first:] if s.candidate in wanted]
         far: dict[Candidate, tuple[Array, ...]] = {candidate: (start,) for candidate, start in spoken_for.items()}
         for candidate in (one.candidate for one in promising):
             if base.excess > LARGE or (base.strained and candidate.effect.name in SPEAKS_FOR.values()):
@@ -276,13 +281,14 @@ class Search:
     def _in_full(
         self, base: Base, screened: Sequence[Screened], trials: dict[Candidate, Trial]
     ) -> dict[Candidate, Trial]:
-        """Trials with the best of them, and the one that the screen has first, fitted further.
+        """Trials with those fitted further that earn the most, or would by the screen, where that is enough.
 
         With the base's derivatives a fit may end halfway, and so hide what an effect earns.
         """
-        best = [s.candidate for s in ranked(base, screened, trials).scores[:_FITTED_IN_FULL]]
-        first = next((s.candidate for s in screened if s.candidate in trials), None)
-        refits = [Refit(s, near=trials[s.candidate].fit.u) for s in screened if s.candidate in {*best, first}]
+        first = [s for s in screened if s.candidate in trials][:1]
+        best = {s.candidate for s in ranked(base, screened, trials).scores[:_FITTED_IN_FULL] if s.total > EVIDENCE}
+        best.update(s.candidate for s in first if s.gain > EVIDENCE)
+        refits = [Refit(s, near=trials[s.candidate].fit.u) for s in screened if s.candidate in best]
         return trials | self.trials(base, refits)
 
     def trials(self, base: Base, refits: Sequence[Refit]) -> dict[Candidate, Trial]:
