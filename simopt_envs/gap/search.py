@@ -384,7 +384,7 @@ def _afresh(trial: Trial) -> Array:
 
 
 def _is_there(base: Base, effect: Candidate, spread: Array) -> bool:
-    """Whether an effect's interval leaves out that there is none of it: of a limit, which has no amount, that it is."""
+    """Whether an effect's interval leaves out that there is none of it; a limit, without an amount, that it is none."""
     hypothesis = base.hypothesis
     off = np.abs(base.fit.u - hypothesis.neutral()) > CONFIDENT * spread
     return bool(np.any(off[hypothesis.amounts(effect) or hypothesis.columns[effect]]))
