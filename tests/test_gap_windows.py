@@ -100,6 +100,22 @@ def test_uncertain_starts_act_linearly_unless_motion_runs_apart(gravity, bends):
     assert largest > 0.1 if bends else largest < 1e-6
 
 
+@pytest.mark.parametrize(("errors", "reaches"), [(1.0, False), (2.0, True)])
+def test_what_happens_beyond_one_standard_error_of_the_start_shows_over_two(errors, reaches):
+    free = mujoco.MjModel.from_xml_string(LOOSE.format(gravity=0.0))
+    time = np.linspace(0.0, 0.5, 51)
+    angle = 1e-3 * np.random.default_rng(0).standard_normal(51)
+    windows = cut_windows(free, Recording(time, {"ctrl/hinge": np.zeros(51), "qpos/hinge": angle}))
+    at_rest = replace(windows.starts, qpos=np.zeros_like(windows.starts.qpos), qvel=np.zeros_like(windows.starts.qvel))
+    spec = mujoco.MjSpec.from_string(LOOSE.format(gravity=0.0))
+    end = 1.5 * float(windows.starts.qpos_error[0, 0])
+    spec.compiler.degree = False
+    spec.joint("hinge").limited, spec.joint("hinge").range = True, [-1.0, end]
+    simulator = WindowSimulator(spec.compile(), replace(windows, starts=at_rest))
+    by_position = start_curvature(free, simulator, errors=errors)[0]
+    assert (np.abs(by_position).max() > 0.01 * end) == reaches
+
+
 @needs_effects
 def test_whole_recordings_are_of_equal_parts_no_longer_than_four_seconds():
     model = mujoco.MjModel.from_xml_string(MODEL)

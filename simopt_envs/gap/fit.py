@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from mujoco import minimize
@@ -174,8 +174,12 @@ class Misfit:
         return np.nan_to_num(np.mean(made[:, made.shape[1] // 2 :], axis=(1, 2)), nan=np.inf)
 
     def bent_by_starts(self, u: Array, scale: Array) -> Array:
-        """The same of whole windows, of what is not linear in the starts, and so not in the noise, (w,)."""
-        return np.nan_to_num(np.mean(self._by_starts(start_curvature, u, scale), axis=(1, 2)), nan=np.inf)
+        """The same of whole windows, of what is not linear in the starts, and so not in the noise, (w,).
+
+        Over two standard errors as well as over one: something, as a finger that catches, may happen beyond the first.
+        """
+        made = [self._by_starts(partial(start_curvature, errors=errors), u, scale) for errors in (1.0, 2.0)]
+        return np.nan_to_num(np.max(np.mean(made, axis=(2, 3)), axis=0), nan=np.inf)
 
     def _by_starts(self, response: Callable[..., Array], u: Array, scale: Array) -> Array:
         changes = response(self.hypothesis.model, self._simulate, self.hypothesis.xi(u[None]))

@@ -161,25 +161,31 @@ def start_sensitivity(
     return np.array(perturbed).reshape(2 * model.nv, *nominal.shape) - nominal
 
 
-def start_curvature(model: mujoco.MjModel, simulator: Simulator, xi: Array | None = None) -> Array:
-    """What :func:`start_sensitivity`, which is linear, leaves out: half of the second difference, (2 nv, w, S, c)."""
+def start_curvature(model: mujoco.MjModel, simulator: Simulator, xi: Array | None = None, errors: float = 1.0) -> Array:
+    """What :func:`start_sensitivity`, which is linear, leaves out: half of the second derivative, (2 nv, w, S, c).
+
+    Args:
+        model: the simulator's model.
+        simulator: of the windows.
+        xi: one vector (1, d); None for the model as it is.
+        errors: standard errors of the start that differences are taken over.
+    """
     nominal, starts = simulator(xi)[0], simulator.windows.starts
-    back = replace(starts, qpos_error=-starts.qpos_error, qvel_error=-starts.qvel_error)
-    pairs = zip(_perturbed(model, starts), _perturbed(model, back), strict=True)
+    pairs = zip(_perturbed(model, starts, errors), _perturbed(model, starts, -errors), strict=True)
     both = [(simulator(xi, above)[0] + simulator(xi, below)[0]) / 2 for above, below in pairs]
-    return np.array(both).reshape(2 * model.nv, *nominal.shape) - nominal
+    return (np.array(both).reshape(2 * model.nv, *nominal.shape) - nominal) / errors**2
 
 
-def _perturbed(model: mujoco.MjModel, starts: States) -> Iterator[States]:
-    """The starts with one degree of freedom after the other moved by its standard error."""
+def _perturbed(model: mujoco.MjModel, starts: States, errors: float = 1.0) -> Iterator[States]:
+    """The starts with one degree of freedom after the other moved by so many of its standard errors."""
     for dof in range(model.nv):
         qpos = starts.qpos.copy()
         for row, error in zip(qpos, starts.qpos_error[:, dof], strict=True):
-            mujoco.mj_integratePos(model, row, np.eye(model.nv)[dof], float(error))
+            mujoco.mj_integratePos(model, row, np.eye(model.nv)[dof], errors * float(error))
         yield replace(starts, qpos=qpos)
     for dof in range(model.nv):
         qvel = starts.qvel.copy()
-        qvel[:, dof] += starts.qvel_error[:, dof]
+        qvel[:, dof] += errors * starts.qvel_error[:, dof]
         yield replace(starts, qvel=qvel)
 
 
