@@ -18,7 +18,7 @@ from simopt_envs.gap.motion import motion_of
 from simopt_envs.gap.plain import Plain, plain_parameters
 from simopt_envs.gap.recordings import read_windows, whole_recordings, without_wild_starts
 from simopt_envs.gap.search import Search
-from simopt_envs.gap.thresholds import BENT, FORGOTTEN
+from simopt_envs.gap.thresholds import BENT, FORGOTTEN, WILD
 from simopt_envs.gap.trial import Data
 from simopt_envs.measured import Recording, WindowSimulator, cut_windows
 from simopt_envs.measured.replay import start_curvature
@@ -100,20 +100,21 @@ def test_uncertain_starts_act_linearly_unless_motion_runs_apart(gravity, bends):
     assert largest > 0.1 if bends else largest < 1e-6
 
 
-@pytest.mark.parametrize(("errors", "reaches"), [(1.0, False), (2.0, True)])
-def test_what_happens_beyond_one_standard_error_of_the_start_shows_over_two(errors, reaches):
-    free = mujoco.MjModel.from_xml_string(LOOSE.format(gravity=0.0))
-    time = np.linspace(0.0, 0.5, 51)
-    angle = 1e-3 * np.random.default_rng(0).standard_normal(51)
-    windows = cut_windows(free, Recording(time, {"ctrl/hinge": np.zeros(51), "qpos/hinge": angle}))
-    at_rest = replace(windows.starts, qpos=np.zeros_like(windows.starts.qpos), qvel=np.zeros_like(windows.starts.qvel))
-    spec = mujoco.MjSpec.from_string(LOOSE.format(gravity=0.0))
-    end = 1.5 * float(windows.starts.qpos_error[0, 0])
+@needs_effects
+@pytest.mark.parametrize(("stop", "bends"), [(1.5, True), (3.0, False)])
+def test_what_happens_within_two_standard_errors_of_a_start_makes_it_decide(stop, bends):
+    spec, error = mujoco.MjSpec.from_string(LOOSE.format(gravity=0.0)), 1e-3
     spec.compiler.degree = False
-    spec.joint("hinge").limited, spec.joint("hinge").range = True, [-1.0, end]
-    simulator = WindowSimulator(spec.compile(), replace(windows, starts=at_rest))
-    by_position = start_curvature(free, simulator, errors=errors)[0]
-    assert (np.abs(by_position).max() > 0.01 * end) == reaches
+    spec.joint("hinge").limited, spec.joint("hinge").range = True, [-1.0, stop * error]
+    plain, time, zeros = plain_parameters(spec), np.linspace(0.0, 1.0, 101), np.zeros(101)
+    recordings = [Recording(time, {"ctrl/hinge": zeros, "qpos/hinge": zeros})]
+    windows = cut_windows(plain.model, recordings, 0.5, history=0.2)
+    none = np.zeros_like(windows.starts.qpos)
+    starts = replace(windows.starts, qpos=none, qvel=none, qpos_error=none + error, qvel_error=none)
+    hypothesis = Hypothesis(plain, (), motion_of(plain.model, recordings))
+    misfit = Misfit(hypothesis, replace(windows, starts=starts))
+    bent = misfit.bent_by_starts(hypothesis.neutral(), np.full(1, 0.01 * error))
+    assert np.all(bent > WILD) if bends else np.all(bent < 1e-6)
 
 
 @needs_effects

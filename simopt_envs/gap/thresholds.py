@@ -9,7 +9,8 @@ demonstration, on one processor); ``FURTHER`` holds for every further effect, no
 ``EVIDENCE`` was 15 nats on the fitted and on the held-out windows each, and held-out windows could not tell alone
 (until seeds 7000 had been run); and ``SIMPLER`` asked for so much on either, not held out. ``CONFIDENT``, the width of
 all intervals, is asked of what is named as well since seeds 8000 had been run; ``REFITTED_AT_MOST`` is new since seeds
-9000 had; and ``WILD`` is asked of two standard errors of a start, too, since seeds 10000 had.
+9000 had; and ``BENT`` and ``WILD`` are asked of two standard errors of a start, too, since seeds 10000 had (two was
+set on one case of these).
 """
 
 EVIDENCE = 20.0
@@ -76,11 +77,10 @@ up to which whole recordings are fitted: where nothing holds a joint it is thous
 
 BENT = 0.1
 """Mean square, in units of the sensors' noise, of what uncertain starts do to whole recordings beyond the linear, up
-to which these are fitted."""
+to which these are fitted. By one standard error of the start or two, the latter as if it was quadratic."""
 
 WILD = 1.0
-"""The same of one window, from which it is left out: more than the sensors' noise. By one standard error of the start
-or two, the latter as if it was quadratic."""
+"""The same of one window, from which it is left out: more than the sensors' noise."""
 
 OUTLYING = 5.0
 """Times what a candidate leaves of the median window, from which what it leaves of such a window, or the start may make
