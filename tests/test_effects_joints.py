@@ -275,6 +275,16 @@ def test_asymmetric_friction_holds_at_rest(push: float, sticks: bool) -> None:
     assert sticks or np.sign(speed[-1]) == np.sign(push)
 
 
+@pytest.mark.parametrize(
+    ("level", "difference", "is_itself"),
+    [(4.0, 3.0, True), (4.0, -7.9, True), (4.0, 1.9, False), (4.0, 8.1, False), (4.0, -8.1, False), (0.0, 1.0, False)],
+)
+def test_a_friction_that_pushes_is_no_asymmetric_friction(level: float, difference: float, is_itself: bool) -> None:
+    model = mujoco.MjModel.from_xml_string(ARM)
+    values = {"frictionloss": level, "difference": difference}
+    assert EFFECTS["asymmetric_friction"].is_itself(model, "joint:drive", MOTION, values) is is_itself
+
+
 def test_stribeck_friction_has_its_peak_at_low_speed() -> None:
     def push(t: float) -> float:
         return 8.0 - 5.0 * t

@@ -9,7 +9,7 @@ from simopt_envs.physics.effects.effect import Effect, Motion, Values, object_na
 from simopt_envs.physics.effects.joints import add_passive_motor, force_unit, probe_force, scalar_joints
 from simopt_envs.physics.parameters import Parameter, Write
 
-_LEAST_DIFFERENCE = 0.5  # of the level
+_LEAST_DIFFERENCE, _MOST_DIFFERENCE = 0.5, 2.0  # of the level
 
 
 class AsymmetricFriction(Effect):
@@ -48,5 +48,9 @@ class AsymmetricFriction(Effect):
         return tuple({"frictionloss": force, "difference": difference} for difference in (force, -force))
 
     def is_itself(self, model: mujoco.MjModel, place: str, motion: Motion, values: Values) -> bool:
-        """A difference below half the level is what a symmetric friction and a constant force are called."""
-        return abs(values["difference"]) > _LEAST_DIFFERENCE * values["frictionloss"]
+        """A difference below half the level is what a symmetric friction and a constant force are called.
+
+        One above twice the level is what a constant force is called: friction pushes in neither direction.
+        """
+        level = values["frictionloss"]
+        return _LEAST_DIFFERENCE * level < abs(values["difference"]) <= _MOST_DIFFERENCE * level
