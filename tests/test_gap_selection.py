@@ -1,4 +1,4 @@
-"""Which recordings are held out, and which of several candidates is called missing."""
+"""Which recordings are held out, which of several candidates is called missing, and what the verdict is."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import pytest
 from simopt_envs.gap.hypothesis import Candidate
 from simopt_envs.gap.large import of_several_effects
 from simopt_envs.gap.recordings import split
+from simopt_envs.gap.result import judge
 from simopt_envs.gap.selection import Score, chosen, tolerance_of
 from simopt_envs.measured import Recording
 from simopt_envs.physics.effects import EFFECTS
@@ -78,6 +79,40 @@ def test_a_simpler_law_is_as_good_where_it_takes_and_leaves_nearly_as_much(base,
     null: Any = SimpleNamespace(excess=base)
     scores = [_score(5, best, 1000.0), _score(4, simple, 900.0)]
     assert chosen(null, null, scores) is scores[simple_wins]
+
+
+@pytest.mark.parametrize(
+    ("best", "simple", "simple_wins"),
+    [
+        (0.12, 0.41, False),  # it alone makes the model right
+        (0.12, 0.21, True),  # both do: nats far fewer than 2 % are a matter of the law's form
+        (0.31, 0.41, True),  # neither does
+    ],
+)
+def test_a_simpler_law_is_no_other_form_of_one_that_alone_makes_the_model_right(best, simple, simple_wins):
+    null: Any = SimpleNamespace(excess=96.0)
+    scores = [_score(5, best, 34_000.0), _score(4, simple, 33_850.0)]
+    assert chosen(null, null, scores) is scores[simple_wins]
+
+
+@pytest.mark.parametrize(
+    ("null", "final", "verdict"),
+    [
+        ([1.5, 6.2, 1.5, 1.5], [1.0, 5.7, 1.0, 1.0], "partly"),  # something else happens in one
+        ([1.1, 6.2, 1.1, 1.1], [1.0, 5.7, 1.0, 1.0], "unexplained"),  # the gap is of that one
+        ([2.5, 6.2, 2.5, 2.5], [2.0, 5.7, 2.0, 2.0], "unexplained"),
+        ([2.5, 6.2, 2.5, 2.5], [1.5, 2.0, 1.5, 1.5], "partly"),
+        ([1.5, 6.2, 1.5, 1.5], [1.0, 1.2, 1.0, 1.0], "named"),
+    ],
+)
+def test_an_effect_that_makes_most_windows_right_explains_a_part(null, final, verdict):
+    def base(mean_squares: list[float]) -> Any:
+        errors = np.sqrt(mean_squares)[:, None, None] * np.ones((1, 26, 2))
+        excess = float(np.mean(errors**2)) - 1
+        return SimpleNamespace(held_out=SimpleNamespace(errors=errors), excess=excess, unforeseen=excess)
+
+    explanation: Any = SimpleNamespace(null=base(null), final=base(final), effects=("one",))
+    assert judge(explanation) == verdict
 
 
 def test_errors_count_in_what_is_left_only_where_that_is_far_more_than_noise():

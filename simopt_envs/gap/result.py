@@ -19,7 +19,7 @@ from simopt_envs.gap.hypothesis import Candidate
 from simopt_envs.gap.localise import Row
 from simopt_envs.gap.repair import column_lines, difference, repaired
 from simopt_envs.gap.thresholds import CONFIDENT, EXPLAINED, LEAST_SHARE
-from simopt_envs.gap.trial import Data
+from simopt_envs.gap.trial import Data, of_median_window
 from simopt_envs.measured.recording import Finding
 from simopt_envs.physics.effects import object_name
 from simopt_envs.physics.effects.actuators import driven_joint
@@ -211,13 +211,18 @@ def _motion(effect: Candidate, partner: Partner) -> dict[str, Any] | None:
 
 
 def judge(explanation: Explanation) -> Verdict:
-    """The verdict on a search, from what is left on recordings that no fit saw."""
+    """The verdict on a search, from what is left on recordings that no fit saw.
+
+    Effects that take away too little are no explanation, unless they make the median window right: then what is left is
+    of a few, in which something else happens as well.
+    """
     right = explanation.final.unforeseen < EXPLAINED - 1
     if not explanation.effects:
         return "none" if right else "unexplained"
     if right:
         return "named"
-    enough = explanation.final.excess < (1 - LEAST_SHARE) * explanation.null.excess
+    before, after = (of_median_window(base.held_out.errors) for base in (explanation.null, explanation.final))
+    enough = explanation.final.excess < (1 - LEAST_SHARE) * explanation.null.excess or after < EXPLAINED < before
     return "partly" if enough else "unexplained"
 
 

@@ -110,7 +110,7 @@ class Search:
         stages = [self._polished(stage)]
         null = base = stages[0].base
         while (best := chosen(null, base, stages[-1].scores)) is not None:
-            base = self._sharpened(best.trial)
+            base = self._contested(stages, self._sharpened(best.trial), best.candidate)
             if len(base.hypothesis.candidates) == min(MOST_EFFECTS, len(self.candidates)):
                 break
             stages.append(self._polished(self.stage(base)))
@@ -254,6 +254,22 @@ class Search:
         best = max(found, key=lambda s: s.gain)
         promising = [s.starts for s in found if s.gain >= _WORTH_A_START * best.gain]
         return replace(best, starts=np.array(promising))
+
+    def _contested(self, stages: Sequence[Stage], base: Base, effect: Candidate) -> Base:
+        """A sharpened base or, where the one before its last effect was far from the data, its best rival's.
+
+        There the noise was that of a model far off, in which fits end early, whatever they could come to.
+        """
+        stage = stages[-1]
+        rivals = stage.rivals(effect)
+        if stage.base.excess < LARGE or not rivals:
+            return base
+        without = self._without(base, effect, stages)
+        near = {score.candidate: score.trial.fit.u for score in stage.scores}
+        refits = [Refit(s, near=near[s.candidate]) for s in stage.screened if s.candidate in rivals]
+        contest = ranked(without, stage.screened, {**self.trials(without, refits), effect: base})
+        best = chosen(stages[0].base, without, contest.scores)
+        return base if best is None or best.candidate == effect else self._sharpened(best.trial)
 
     def _large(self, base: Base, screened: Sequence[Screened]) -> list[Candidate]:
         """The candidates that come nearest to the data at some size, where the base is far from them.

@@ -76,11 +76,11 @@ def chosen(null: Base, base: Base, scores: Sequence[Score]) -> Score | None:
     A law of slightly another form than the true one leaves an error that nothing in the library describes, but much of
     it bends a little. So a further effect must make the model right, to what noise is, or explain a share of what the
     ones before it did. Where even the best leaves more than noise, a simpler one that takes, and leaves, nearly as much
-    is as good.
+    is as good. Where the best makes the model right, one that does not is not that law in another form.
     """
-    earned = [score for score in scores if score.earned]
+    earned, right = [score for score in scores if score.earned], EXPLAINED - 1
     if base is not null:
-        right, least = EXPLAINED - 1, FURTHER * (null.excess - base.excess)
+        least = FURTHER * (null.excess - base.excess)
         earned = [
             s
             for s in earned
@@ -91,13 +91,17 @@ def chosen(null: Base, base: Base, scores: Sequence[Score]) -> Score | None:
     best = earned[0]
     most = base.excess - SIMPLER_SHARE * (base.excess - best.trial.excess)
     enough = min(most, SIMPLER_LEAVES * best.trial.excess)
-    clearly = max(SIMPLER, FURTHER * best.held_out)
+
+    def clearly(score: Score) -> float:
+        alone_right = best.trial.excess < right < score.trial.excess
+        return SIMPLER if alone_right else max(SIMPLER, FURTHER * best.held_out)
+
     as_good = [
         s
         for s in earned
-        if best.held_out - s.held_out < clearly
-        or best.total - s.total < clearly
-        or enough > s.trial.excess > best.trial.excess > EXPLAINED - 1
+        if best.held_out - s.held_out < clearly(s)
+        or best.total - s.total < clearly(s)
+        or enough > s.trial.excess > best.trial.excess > right
     ]
     return min(as_good, key=lambda score: (len(score.trial.fit.u), -score.total))
 
