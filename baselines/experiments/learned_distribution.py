@@ -53,54 +53,51 @@ def _episodes(run: Result) -> float:
 
 
 def _tables(results: Results) -> list[Table]:
-    rows = []
+    tables = []
     for task in FIXED:
+        rows = []
         for name in _settings(task):
             runs = _runs(results, task, name)
             if runs:
                 learned = [_episodes(run) for run in runs if np.isfinite(_episodes(run))]
                 successes = [_success(runs, target) for target in FAR[task]]
-                row = [task, name, str(len(runs)), f"{len(learned)} of {len(runs)}"]
+                row = [name, str(len(runs)), f"{len(learned)} of {len(runs)}"]
                 row += [
                     mean_of(learned).text(digits=0) if learned else "",
                     *(s.percent if s else "" for s in successes),
                 ]
                 rows.append(row)
-    header = [
-        "task",
-        "p(ξ)",
-        "seeds",
-        "reached 90 %",
-        "episodes until then",
-        *(f"success on {t}" for t in FAR["drawer"]),
-    ]
-    caption = "Trainings from scratch; those 90 % are of episodes under the training's own p(ξ)."
-    return [Table(caption, header, rows)]
+        header = ["p(ξ)", "seeds", "reached 90 %", "episodes until then", *(f"success on {t}" for t in FAR[task])]
+        caption = (
+            f"Trainings of the {task} policy from scratch; those 90 % are of episodes under the training's own p(ξ)."
+        )
+        if rows:
+            tables.append(Table(caption, header, rows))
+    return tables
 
 
 def _figure(results: Results) -> Figure:
-    figure, (curves, success) = new_figure(2)
+    figure, (*curves, success) = new_figure(len(FIXED) + 1, width=14.0)
     rows: dict[str, Estimate] = {}
-    named = [(task, name) for task in FIXED for name in _settings(task)]
-    for index, (task, name) in enumerate(named):
-        runs = _runs(results, task, name)
-        for run in runs:
-            steps, reached = np.array([(s, np.nan if y is None else y) for s, y in run["curve"]]).T
-            look = style(index) | {"marker": ""}
-            curves.plot(
-                steps / EPISODE_STEPS / 1000, reached, **look, label=f"{task}, {name}" if run is runs[0] else ""
-            )
+    for axes, task in zip(curves, FIXED, strict=True):
+        for index, name in enumerate(_settings(task)):
+            runs = _runs(results, task, name)
+            for run in runs:
+                steps, reached = np.array([(s, np.nan if y is None else y) for s, y in run["curve"]]).T
+                look = style(index) | {"marker": ""}
+                axes.plot(steps / EPISODE_STEPS / 1000, reached, **look, label=name if run is runs[0] else "")
+        axes.set(title=f"{task}: success under its own p(ξ)", xlabel="thousand episodes of training")
+        if axes.lines:
+            axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=2)
+        as_percent(axes)
     for task in FIXED:
         for target in FAR[task]:
             for name in _settings(task):
                 estimate = _success(_runs(results, task, name), target)
                 if estimate:
                     rows[f"{task}, {target}: {name}"] = estimate
-    curves.set(title="Success under the training's own p(ξ)", xlabel="thousand episodes of training")
-    curves.legend(loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=2)
     success.set(title="Success on the target after training")
     draw_points(success, rows)
-    as_percent(curves)
     as_percent(success, "x")
     return figure
 
