@@ -1,5 +1,6 @@
 """The experiments without their cost: cells are declared, run once, and told as tables, figures and sentences."""
 
+import re
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -285,9 +286,16 @@ def test_iterations_are_counted_until_the_policy_works():
     assert iterations.count([np.inf, np.inf, 1.0], runs) == "over 2"
 
 
+def test_rows_of_a_table_are_as_long_as_its_header(pages):
+    tables = [table for page in pages[0].values() for table in re.findall(r"(?:^\|.*\n)+", page, re.MULTILINE)]
+    assert len(tables) >= len(pages[0])
+    for table in tables:
+        assert len({row.count("|") for row in table.splitlines()}) == 1, table
+
+
 def test_learned_distribution_tells_of_trainings_that_never_succeed(pages):
     page = pages[0]["learned_distribution"]
-    assert "| drawer | x 10 cm | 5 | 0 of 5 |  | 2 % [1, 4] | 2 % [1, 4] |" in page
+    assert "| x 10 cm | 5 | 0 of 5 |  | 2 % [1, 4] | 2 % [1, 4] |" in page
     assert "takes 5,000 episodes, against over 6,400 (medians)" in page
 
 
