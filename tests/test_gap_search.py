@@ -15,6 +15,7 @@ from simopt_envs.gap.motion import motion_of
 from simopt_envs.gap.plain import plain_parameters
 from simopt_envs.gap.recordings import read_windows
 from simopt_envs.gap.search import Search, _is_there
+from simopt_envs.gap.thresholds import LARGE
 from simopt_envs.physics.effects import EFFECTS
 
 pytestmark = needs_effects
@@ -22,6 +23,7 @@ pytestmark = needs_effects
 SPRING = Candidate(EFFECTS["joint_spring"], "joint:shoulder")
 DRY = Candidate(EFFECTS["coulomb_friction"], "joint:elbow")
 COGGING = Candidate(EFFECTS["cogging"], "joint:elbow")
+PUSH = Candidate(EFFECTS["actuator_bias"], "actuator:shoulder")
 LIMIT = Candidate(EFFECTS["actuator_saturation"], "actuator:elbow")
 ONE_SIDED = Candidate(EFFECTS["asymmetric_friction"], "joint:elbow")
 
@@ -52,6 +54,17 @@ def test_an_effect_gives_way_to_the_rival_that_explains_more_beside_the_others(d
     assert effects[0].total > effects[1].total
     assert stages[1].base.hypothesis.candidates == (SPRING,)
     assert {score.candidate for score in stages[1].scores} == {DRY, ONE_SIDED}
+
+
+@pytest.mark.parametrize(("stiffness", "kept"), [(3.0, SPRING), (0.3, PUSH)])
+def test_far_from_the_data_what_is_taken_is_held_against_its_rivals_anew(stiffness, kept):
+    """A constant force was taken for a spring at the shoulder; near the data the first fits are believed."""
+    search = _search(lambda q, v: np.array([-stiffness * (q[0] - 2.0), 0.0]), (SPRING, PUSH))
+    stage = search.stage(search.base())
+    (push,) = (score.trial for score in stage.scores if score.candidate == PUSH)
+    base = search._contested([stage], search._sharpened(push), PUSH)
+    assert (stage.base.excess > LARGE) == (stiffness > 1)
+    assert base.hypothesis.candidates == (kept,)
 
 
 @pytest.mark.parametrize("friction", [0.5, 0.0])
