@@ -153,7 +153,7 @@ def _draw_instances(axes: Axes, task: str, instances: list[Result]) -> None:
         look = style(index) | {"linestyle": "none", "marker": "o" if solved else "X"}
         axes.plot([100 * xi[x] for xi in chosen], [100 * xi[y] for xi in chosen], label=label, **look)
     axes.set(title="Drawn instances", xlabel=f"{x} [cm]", ylabel=f"{y} [cm]")
-    axes.legend()
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2)  # instances may be anywhere
 
 
 def _findings(results: Results) -> list[str]:
