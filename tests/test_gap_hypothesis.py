@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from simopt_envs.gap.large import of_some_size
 from simopt_envs.gap.motion import motion_of
 from simopt_envs.gap.plain import plain_parameters
 from simopt_envs.gap.recordings import read_windows
-from simopt_envs.measured import Recording
+from simopt_envs.measured import Recording, cut_windows
 from simopt_envs.physics.effects import EFFECTS
 from simopt_envs.physics.parameters import ParameterSpace
 from simopt_envs.physics.writer import ModelWriter
@@ -22,6 +24,19 @@ from simopt_envs.physics.writer import ModelWriter
 pytestmark = needs_effects
 
 
+_DRAWER = """
+<mujoco>
+  <option timestep="0.002" integrator="implicitfast"/>
+  <worldbody>
+    <body name="drawer">
+      <joint name="drawer" type="slide" axis="1 0 0" stiffness="20" damping="1"/>
+      <geom size="0.05" mass="1"/>
+      <site name="handle" pos="0.1 0 0"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="drawer" joint="drawer"/></actuator>
+</mujoco>
+"""
 _SOFT = ("backlash", "load_dependent_friction")
 
 
@@ -71,6 +86,23 @@ def test_a_link_starts_where_it_rests_under_its_load(name, value):
     assert stiff > 20 * rest  # a link that did not give would show its tip elsewhere
 
 
+def test_a_drawer_without_an_encoder_starts_where_its_handle_shows_it():
+    plain = plain_parameters(mujoco.MjSpec.from_string(_DRAWER))
+    candidate, offset = Candidate(EFFECTS["frame_offset"], "site:handle"), 0.01
+    measured = _of_drawer(plain.model, offset)
+    windows = cut_windows(plain.model, measured, 0.5, history=0.2)
+    hypothesis = Hypothesis(plain, [candidate], motion_of(plain.model, [measured]))
+    xi = np.tile(hypothesis.space.nominal, (2, 1))
+    xi[1, hypothesis.space.index(candidate.full_name("x"))] = offset
+    simulate = hypothesis.simulator(windows)
+    without, within = np.abs(simulate(xi) - windows.measured).max(axis=(1, 2, 3))
+    assert within < 1e-3  # its spring pulls from where it is, not from where its handle seems to be
+    assert without > 10 * within
+    pushed = replace(windows.starts, qpos=windows.starts.qpos + 0.005)  # as by whoever asks what starts do
+    moved = simulate(xi[1:], pushed)[0, :, 0, 0] - windows.measured[:, 0, 0]
+    np.testing.assert_allclose(moved, 0.005, atol=1e-3)
+
+
 def test_a_large_effect_is_tried_at_about_its_size(arm):
     plain, data, motion = arm
     candidate = Candidate(EFFECTS["coulomb_friction"], "joint:shoulder")
@@ -79,6 +111,17 @@ def test_a_large_effect_is_tried_at_about_its_size(arm):
     found = of_some_size(misfit, candidate, hypothesis.neutral())
     (friction,) = hypothesis.values(candidate, hypothesis.xi(found[None])[0]).values()
     assert friction == pytest.approx(4.0, rel=0.2)
+
+
+def _of_drawer(model: mujoco.MjModel, offset: float) -> Recording:
+    """Its handle, which is elsewhere, as the spring of the drawer swings it."""
+    data, seen = mujoco.MjData(model), []
+    data.qpos[:] = 0.2
+    for _ in range(210):
+        mujoco.mj_step(model, data, 5)
+        seen.append(data.qpos[0] + 0.1 + offset)
+    columns = {"ctrl/drawer": np.zeros(210), "site/handle/x": np.array(seen)}
+    return Recording(0.01 * np.arange(210), columns, "swinging")
 
 
 def _rigid(plain, data, motion):

@@ -11,8 +11,9 @@ import numpy as np
 
 from simopt_envs.gap.plain import INTEGRATION_LEAD, Plain
 from simopt_envs.gap.starts import loads, starts_of
+from simopt_envs.gap.unseen import UnseenJoints
 from simopt_envs.measured.channels import Channel, model_channels
-from simopt_envs.measured.states import States
+from simopt_envs.measured.states import States, depends_on_stage
 from simopt_envs.measured.windows import Windows, WindowSimulator
 from simopt_envs.physics.columns import ColumnModel, CommandModel, acts_on_columns
 from simopt_envs.physics.effects import Effect, Motion, object_name
@@ -191,6 +192,7 @@ class HypothesisSimulator:
         self._of_model = [i for i, p in enumerate(hypothesis.space) if not acts_on_columns(p)]
         space = ParameterSpace(hypothesis.space.parameters[i] for i in self._of_model)
         self._simulate = WindowSimulator(hypothesis.model, self.windows, space, num_threads)
+        self._unseen = UnseenJoints(hypothesis.model, space, self.windows, given) if hypothesis.candidates else None
 
     def __call__(self, xi: Array | None = None, starts: States | None = None) -> Array:
         """Predicted columns (n, w, S, c) for ξ (n, d), by default the nominal one; NaN from where it diverged."""
@@ -230,6 +232,8 @@ class HypothesisSimulator:
                 repeated.qvel[:, dof] = self._columns.meant(c, xi, velocity, acceleration).ravel()
         if self._loads:
             self._deflect(repeated.qpos, xi)
+        if self._unseen:
+            self._unseen.place(repeated.qpos, starts, xi, self._of_model, self._columns)
         leads = np.repeat(np.sum(xi[:, self._lead], axis=1), len(starts))
         for qpos, qvel, lead in zip(repeated.qpos, repeated.qvel, leads, strict=True):
             mujoco.mj_integratePos(self._model, qpos, qvel, float(lead))
@@ -247,6 +251,4 @@ class HypothesisSimulator:
 
 def _is_position(model: mujoco.MjModel, channel: Channel) -> bool:
     """Whether a column follows from positions alone."""
-    if channel.kind == "sensordata":
-        return int(model.sensor_needstage[channel.object]) == int(mujoco.mjtStage.mjSTAGE_POS)
-    return channel.kind in ("qpos", "site_xpos")
+    return channel.kind == "qpos" or depends_on_stage(model, channel, mujoco.mjtStage.mjSTAGE_POS)

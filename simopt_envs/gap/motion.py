@@ -25,8 +25,8 @@ def motion_of(model: mujoco.MjModel, recordings: Sequence[Recording], keyframe: 
     for recording in recordings:
         grid = recording.resample(recording.period)
         samples = np.unique(np.linspace(0, len(grid) - 1, _SAMPLES).astype(np.intp))
-        joints = [grid[name] for name in grid.signals if name.startswith("qpos/")]
-        samples = samples[np.all([np.isfinite(values[samples]) for values in joints], axis=0)]
+        joints = [grid[name][samples] for name in grid.signals if name.startswith("qpos/")]
+        samples = samples[np.isfinite(np.array(joints).reshape(-1, len(samples))).all(axis=0)]
         states = estimate_states(model, grid, samples, keyframe)
         qpos.append(states.qpos)
         qvel.append(states.qvel)

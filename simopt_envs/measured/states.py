@@ -145,8 +145,8 @@ def _fit_unseen(
 ) -> None:
     """Fit the degrees of freedom without a column, in place: positions by least squares, then velocities linearly."""
     data = mujoco.MjData(model)
-    position = [c for c in seen if _depends_on(model, c, mujoco.mjtStage.mjSTAGE_POS)]
-    velocity = [c for c in seen if _depends_on(model, c, mujoco.mjtStage.mjSTAGE_VEL)]
+    position = [c for c in seen if depends_on_stage(model, c, mujoco.mjtStage.mjSTAGE_POS)]
+    velocity = [c for c in seen if depends_on_stage(model, c, mujoco.mjtStage.mjSTAGE_VEL)]
 
     def measured(channels: list[Channel], attribute: str, sample: int) -> Array:
         return np.array([getattr(smoothed[c.name], attribute)[sample] for c in channels])
@@ -167,7 +167,7 @@ def _fit_unseen(
             return qpos
 
         def misfit(offset: Array, targets: Array = targets, error: Array = position_error) -> Array:
-            values = _read(model, data, posture(offset), np.zeros(model.nv), position)
+            values = read_state(model, data, posture(offset), np.zeros(model.nv), position)
             return np.append(np.nan_to_num((values - targets) / error), offset / _POSITION_PRIOR)
 
         fit = least_squares(misfit, offset)
@@ -181,8 +181,8 @@ def _fit_unseen(
         def predicted_rates(qvel: Array, qpos: Array = qpos) -> Array:
             step, later = 1e-5, qpos.copy()
             mujoco.mj_integratePos(model, later, qvel, step)
-            moved = _read(model, data, later, qvel, position) - _read(model, data, qpos, qvel, position)
-            return np.append(moved / step, _read(model, data, qpos, qvel, velocity))
+            moved = read_state(model, data, later, qvel, position) - read_state(model, data, qpos, qvel, position)
+            return np.append(moved / step, read_state(model, data, qpos, qvel, velocity))
 
         at_base = predicted_rates(base)
         unit = np.eye(model.nv)[dofs]
@@ -194,14 +194,14 @@ def _fit_unseen(
         states.qvel_error[w, dofs] = np.sqrt(np.diag(np.linalg.inv(precision)))
 
 
-def _depends_on(model: mujoco.MjModel, channel: Channel, stage: mujoco.mjtStage) -> bool:
+def depends_on_stage(model: mujoco.MjModel, channel: Channel, stage: mujoco.mjtStage) -> bool:
     """Whether a column is a sensor of this stage, or a site, which is of the position stage."""
     if channel.kind == "site_xpos":
         return stage == mujoco.mjtStage.mjSTAGE_POS
     return channel.kind == "sensordata" and int(model.sensor_needstage[channel.object]) == int(stage)
 
 
-def _read(model: mujoco.MjModel, data: mujoco.MjData, qpos: Array, qvel: Array, channels: list[Channel]) -> Array:
+def read_state(model: mujoco.MjModel, data: mujoco.MjData, qpos: Array, qvel: Array, channels: list[Channel]) -> Array:
     """What some position and velocity columns read in a state, (c,)."""
     if not channels:
         return np.empty(0)
