@@ -40,6 +40,8 @@ class UnseenJoints:
         position = mujoco.mjtStage.mjSTAGE_POS
         self._columns = [c for c, channel in enumerate(windows.channels) if depends_on_stage(model, channel, position)]
         self._channels = [windows.channels[c] for c in self._columns]
+        if not self:  # a model with meshes is large, and most have an encoder at every joint
+            return
         self._model, self._data, self._nominal = copy.copy(model), mujoco.MjData(model), space.nominal
         self._writer = ModelWriter(self._model, space)
 
