@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from simopt_envs.gap.hypothesis import Candidate
+from simopt_envs.gap.screen import Screened
 from simopt_envs.gap.selection import Score, score_of, worth_of
 from simopt_envs.gap.thresholds import EVIDENCE
-from simopt_envs.gap.trial import Base, Data, Screened, Trial
+from simopt_envs.gap.trial import Base, Data, Trial
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ import numpy as np
 from simopt_envs.adaptation.fitting import Noise
 from simopt_envs.gap.fit import Misfit
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
+from simopt_envs.gap.screen import Screened
 from simopt_envs.gap.thresholds import LARGE_REFITTED
-from simopt_envs.gap.trial import Screened
 from simopt_envs.measured.windows import Windows
 from simopt_envs.physics.parameters import Array
 

@@ -10,7 +10,8 @@ from simopt_envs.adaptation.checkpoint import Result
 from simopt_envs.gap.fit import DIFFERENCES, Fit, Misfit, fit
 from simopt_envs.gap.large import of_some_size
 from simopt_envs.gap.predictive import HeldOut
-from simopt_envs.gap.trial import Base, Screened
+from simopt_envs.gap.screen import Screened
+from simopt_envs.gap.trial import Base
 from simopt_envs.measured.windows import Windows
 from simopt_envs.physics.parameters import Array
 

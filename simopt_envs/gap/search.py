@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from simopt_envs.gap.plain import SPEAKS_FOR, Plain
 from simopt_envs.gap.predictive import HeldOut
 from simopt_envs.gap.recordings import without_wild_starts
 from simopt_envs.gap.refit import ITERATIONS, Refit, fitted
+from simopt_envs.gap.screen import Screened, screen
 from simopt_envs.gap.selection import Score, chosen, score_of, tolerance_of, worth_of
 from simopt_envs.gap.thresholds import (
     BENT,
@@ -36,17 +36,14 @@ from simopt_envs.gap.thresholds import (
     REFITTED,
     REFITTED_AT_MOST,
 )
-from simopt_envs.gap.trial import Base, Data, Screened, Trial, of_median_window
+from simopt_envs.gap.trial import Base, Data, Trial, of_median_window
 from simopt_envs.physics.effects import Motion
 from simopt_envs.physics.parameters import Array
 
 Progress = Callable[[str, int, int], None]
 """Is told what is being done, and how many of how many are done."""
 
-_STEPS = np.array([1.0, 0.3, 0.1, 0.03])  # shares of the screen's step that a fit may start from
-_WORTH_A_START = 0.2  # share of the best probe's gain at which a fit may start from another one
 _FITTED_IN_FULL = 3  # candidates
-_FURTHEST = 20.0  # probes that the screen's step may be long
 _SECONDS_OF_LARGE = 2.0  # of the worst windows, that candidates of several sizes are tried on
 _TRIED_FINELY = 4  # times as many candidates as are fitted at such a size are tried at finer ones
 _BETTER = 2.0  # nats by which a base must become better for its candidates to be fitted anew
@@ -202,13 +199,8 @@ class Search:
         return ranked(base, screened, self._in_full(base, screened, trials))
 
     def _screened(self, base: Base) -> list[Screened]:
-        """All candidates that the base lacks, largest expected gain first."""
-        open_candidates = [c for c in self.candidates if c not in base.hypothesis.candidates]
-        screened = []
-        for done, candidate in enumerate(open_candidates):
-            self._progress("screen", done, len(open_candidates))
-            screened.append(self.screen(base, candidate))
-        return sorted(screened, key=lambda s: -s.gain)
+        """All candidates, as they would act on a base."""
+        return screen(base, self.candidates, self.data.fitted, partial(self._progress, "screen"))
 
     def _polished(self, stage: Stage) -> Stage:
         """A stage from the base fitted from where candidates led its parameters, if it comes out better there.
@@ -226,34 +218,6 @@ class Search:
         base = stage.base
         misfit = Misfit(base.hypothesis, self.data.fitted).with_noise(base.noise)
         return misfit.best(np.array([score.trial.fit.u[: len(base.fit.u)] for score in stage.scores]))
-
-    def screen(self, base: Base, candidate: Candidate) -> Screened:
-        """What a candidate would gain if its best probe acted linearly."""
-        hypothesis = Hypothesis(self.plain, [*base.hypothesis.candidates, candidate], self.motion)
-        misfit = Misfit(hypothesis, self.data.fitted).with_noise(base.noise)
-        amounts, neutral = hypothesis.amounts(candidate), hypothesis.neutral()
-        probes = hypothesis.probes(candidate)
-        probes[:, : len(base.fit.u)] = base.fit.u
-        residual, (orthonormal, triangle) = base.fit.residual, base.fit.orthonormal
-        found: list[Screened] = []
-        without = neutral.copy()
-        without[: len(base.fit.u)] = base.fit.u
-        errors = misfit.errors(np.concatenate([without[None], probes]))  # a structure alone changes a little
-        for probe, change_of_data in zip(probes, errors[1:] - errors[0], strict=True):
-            change = np.concatenate([change_of_data.ravel(), np.zeros(len(base.fit.u))])
-            absorbed = orthonormal.T @ change
-            direction = change - orthonormal @ absorbed
-            size, slope = float(direction @ direction), float(direction @ residual)
-            step = _clipped(-slope / size if size > 0 else 0.0, probe - neutral, neutral, hypothesis, amounts)
-            gain = -step * slope - 0.5 * step**2 * size
-            origin, shift = probe.copy(), np.zeros(len(probe))
-            shift[: len(base.fit.u)] = -np.linalg.solve(triangle, absorbed)
-            origin[amounts], shift[amounts] = neutral[amounts], (probe - neutral)[amounts]
-            starts = np.clip(origin + step * _STEPS[:, None] * shift, hypothesis.low, hypothesis.high)
-            found.append(Screened(candidate, hypothesis, direction, gain, starts))
-        best = max(found, key=lambda s: s.gain)
-        promising = [s.starts for s in found if s.gain >= _WORTH_A_START * best.gain]
-        return replace(best, starts=np.array(promising))
 
     def _contested(self, stages: Sequence[Stage], base: Base, effect: Candidate) -> Base:
         """A sharpened base or, where the one before its last effect was far from the data, its best rival's.
@@ -404,12 +368,3 @@ def _is_there(base: Base, effect: Candidate, spread: Array) -> bool:
     hypothesis = base.hypothesis
     off = np.abs(base.fit.u - hypothesis.neutral()) > CONFIDENT * spread
     return bool(np.any(off[hypothesis.amounts(effect) or hypothesis.columns[effect]]))
-
-
-def _clipped(step: float, shift: Array, neutral: Array, hypothesis: Hypothesis, columns: list[int]) -> float:
-    """A step along a shift of some coordinates that stays within their bounds and is not absurdly long."""
-    moving = [c for c in columns if shift[c]]
-    bounds = np.array([hypothesis.low[moving], hypothesis.high[moving]])
-    ends = (bounds - neutral[moving]) / shift[moving]
-    smallest, largest = ends.min(axis=0).max(initial=-_FURTHEST), ends.max(axis=0).min(initial=_FURTHEST)
-    return float(np.clip(step, smallest, largest))

@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from simopt_envs.adaptation.fitting import Noise
 from simopt_envs.gap.fit import DIFFERENCES, Fit, Misfit
-from simopt_envs.gap.hypothesis import Candidate, Hypothesis
+from simopt_envs.gap.hypothesis import Hypothesis
 from simopt_envs.gap.predictive import HeldOut, precision
 from simopt_envs.gap.thresholds import EXPLAINED, FAR, WINDOW
 from simopt_envs.measured.recording import Finding, Recording
@@ -116,22 +116,3 @@ class Base(Trial):
         misfit = Misfit(self.hypothesis, data.fitted).with_noise(self.noise)
         other = misfit.jacobian(self.fit.u, difference=DIFFERENCES[1])
         return np.sqrt(self.fit.variance(other, max(1.0, mean_square), data.parts))
-
-
-@dataclass(frozen=True)
-class Screened:
-    """A candidate that acts linearly.
-
-    Attributes:
-        candidate: the effect and its place.
-        hypothesis: the base's with the candidate.
-        direction: what its best probe changes in the base's residual, plain parameters projected out, (m,).
-        gain: in -log p, of the best multiple of that probe.
-        starts: u from which a fit may start, some for each promising probe, (n, k, d).
-    """
-
-    candidate: Candidate
-    hypothesis: Hypothesis
-    direction: Array
-    gain: float
-    starts: Array
