@@ -267,12 +267,12 @@ def test_a_part_of_the_results_says_what_is_missing(tmp_path):
     assert "`python -m baselines.experiments iterations --quick`; seeds 0, 1; 3 of 70 cells" in page
     assert "Not run yet: 5cm-1rollouts, " in page
     assert "| 15 cm | 3 | 2 | 0 % → 55 % → 98 % |" in page
-    assert "as seeds differ in how hard they are: 22cm-3rollouts (0)." in page
+    assert "as seeds differ in how hard they are: 15cm-3rollouts (0, 1); 22cm-3rollouts (0)." in page
 
 
 def test_randomization_compares_with_the_best_fixed_one(pages):
     page = pages[0]["randomization"]
-    assert "| SimOpt | 99 % [97, 100] | 99 % [97, 100] | 99 % [97, 100] | 99 % [97, 100] |" in page
+    assert "| SimOpt | 99 % [97, 100] | 99 % [97, 100] | 100 % [99, 100] | 99 % [97, 100] |" in page
     assert "drawer, 22 cm: SimOpt 99 % [97, 100], from 2 % [1, 4] of the policy it starts with. Its" in page
     assert "of 24 instances drawn from xyz 10 cm, a policy trained for each alone could not solve 8 (" in page
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from inspect import cleandoc
@@ -94,7 +95,8 @@ def _made(question: Question, cells: list[Cell], results: Results, store: Store)
     if len(finished) < len(cells):
         if conditions := dict.fromkeys(cell.condition for cell in cells if cell.condition not in results):
             lines.append(f"Not run yet: {', '.join(conditions)}.")
-        if partial := {c: of_seed for c, of_seed in results.items() if len(of_seed) < len(seeds)}:
+        planned = Counter(cell.condition for cell in cells)
+        if partial := {c: of_seed for c, of_seed in results.items() if len(of_seed) < planned[c]}:
             listed = (f"{c} ({', '.join(map(str, sorted(of_seed)))})" for c, of_seed in partial.items())
             lines.append(
                 "Of some seeds only, so not to be compared with what has all, as seeds differ in how hard they are:"
