@@ -200,7 +200,7 @@ def _findings(results: Results) -> list[str]:
     own = {name: _own_success(results, "drawer", name) for name in _NOT_IN_THE_PAPER}
     if all(own.values()):
         shares = " and ".join(f"{share} under {name}" for name, share in own.items())
-        found.append(f"drawer: the policy succeeds in its own simulations in {shares}; the paper's opens the drawer under neither.")
+        found.append(f"drawer: in its own simulations the policy succeeds in {shares}; in the paper under neither.")
     return found
 
 
