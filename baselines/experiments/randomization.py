@@ -47,8 +47,8 @@ FIXED: Mapping[str, Mapping[str, Randomization]] = {
     },
 }
 """Task -> fixed randomizations by name."""
-START = {"drawer": "xyz 2 cm", "peg": "narrow"}
-"""The one that SimOpt starts from."""
+START = {"drawer": "x 10 cm", "peg": "narrow"}
+"""Task -> the one whose policy an instance begins with."""
 WIDEST = {"drawer": "xyz 10 cm", "peg": "all wide"}
 TARGETS = {
     "drawer": {shift: drawer(shift) for shift in SHIFTS},
@@ -90,8 +90,7 @@ def _cells() -> list[Cell]:
             for seed in _seeds(task, "SimOpt", target):
                 quick = seed < QUICK_SEEDS.get(target, 0)
                 cells.append(Cell(_NAME, condition(task, "SimOpt", target), seed, cure, quick))
-        start = "x 10 cm" if task == "drawer" else START[task]
-        instance = Instance(fixed[WIDEST[task]], fixed[start])
+        instance = Instance(fixed[WIDEST[task]], fixed[START[task]])
         for draw in range(_INSTANCES[task]):
             quick = task == "drawer" and draw < 3
             cells.append(Cell(_NAME, condition(task, "instance"), draw, instance, quick))
@@ -107,6 +106,12 @@ def _success(results: Results, task: str, name: str, target: str) -> Estimate | 
     runs = list(found.values())
     rates = [run["success"][-1] if name == "SimOpt" else run["success"][target] for run in runs]
     return success_of(rates, runs[0]["episodes"])
+
+
+def _before(results: Results, task: str, target: str) -> Estimate:
+    """Success on a target of the policies that SimOpt starts with."""
+    runs = list(results[condition(task, "SimOpt", target)].values())
+    return success_of([run["success"][0] for run in runs], runs[0]["episodes"])
 
 
 def _own_success(results: Results, task: str, name: str) -> str:
@@ -180,15 +185,15 @@ def _findings(results: Results) -> list[str]:
         for target in targets:
             fixed = {name: _success(results, task, name, target) for name in FIXED[task]}
             known = {name: estimate for name, estimate in fixed.items() if estimate}
-            simopt, start = _success(results, task, "SimOpt", target), known.get(START[task])
+            simopt = _success(results, task, "SimOpt", target)
             if not (simopt and known):
                 continue
             best = max(known, key=lambda name: known[name].mean)
             apart = "lies above" if simopt.above(known[best]) else "does not lie wholly above"
             found.append(
-                f"{task}, {target}: SimOpt {simopt.percent}"
-                + (f", from {start.percent} of the policy it starts with" if start else "")
-                + f". Its interval {apart} that of the best fixed randomization, {best}, {known[best].percent}."
+                f"{task}, {target}: SimOpt {simopt.percent}, from {_before(results, task, target).percent} of the"
+                f" policies it starts with. Its interval {apart} that of the best fixed randomization, {best},"
+                f" {known[best].percent}."
             )
         instances = _instances(results, task)
         if instances:
