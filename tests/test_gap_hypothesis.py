@@ -108,7 +108,7 @@ def test_a_large_effect_is_tried_at_about_its_size(arm):
     candidate = Candidate(EFFECTS["coulomb_friction"], "joint:shoulder")
     hypothesis = Hypothesis(plain, [candidate], motion)
     misfit = Misfit(hypothesis, data.fitted)
-    found = of_some_size(misfit, candidate, hypothesis.neutral())
+    (found,) = of_some_size(misfit, candidate, hypothesis.neutral())
     (friction,) = hypothesis.values(candidate, hypothesis.xi(found[None])[0]).values()
     assert friction == pytest.approx(4.0, rel=0.2)
 

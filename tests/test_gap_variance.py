@@ -51,7 +51,9 @@ class _TwoAsOne(Misfit):
         self._slope = rng.normal(size=(_WINDOWS, _SAMPLES, 1))
         self._rough = roughness * rng.normal(size=(2, _WINDOWS, _SAMPLES, 1))
         self._waves = rng.uniform(100.0, 1000.0, size=(2, _WINDOWS, _SAMPLES, 1))
-        self.hypothesis: Any = SimpleNamespace(low=np.full(2, -9.0), high=np.full(2, 9.0), prior_std=np.ones(2))
+        self.hypothesis: Any = SimpleNamespace(
+            products=[], reach=np.ones_like, low=np.full(2, -9.0), high=np.full(2, 9.0), prior_std=np.ones(2)
+        )
 
     def errors(self, u: Array) -> Array:
         each = u[:, :, None, None, None]

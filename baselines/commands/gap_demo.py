@@ -32,7 +32,7 @@ HIDDEN: tuple[Mapping[str, Any], ...] = (
 """What the hidden arm may have: a load at the hand, a cable that pulls the shoulder, a shoulder that binds."""
 
 _NOISE = 0.002  # rad, m
-_ROLLOUTS = 6  # measured per iteration
+_ROLLOUTS = 3  # measured per iteration
 _ENOUGH = 0.9
 _LEAST_STD = 0.02  # of a new parameter's value
 
@@ -62,8 +62,9 @@ class GapDemo:
         prior = inputs.distribution(ENV_ID, simulator.parameters, ())
         first, alone = self._adapt(simulator, prior, robot, self.out)
 
-        # The rollouts that SimOpt adapted to, in vain.
-        effects = self._missing(prior, [robot.log(trajectory) for trajectory in first.real], display)
+        # The rollouts that SimOpt adapted to, in vain, and those that showed it.
+        logs = dict.fromkeys(robot.log(trajectory) for step in (first, alone) for trajectory in step.real)
+        effects = self._missing(prior, list(logs), display)
         if not effects:
             display.say("The gap workflow names nothing; the simulation cannot be repaired.")
             return

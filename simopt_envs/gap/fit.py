@@ -14,6 +14,7 @@ import numpy as np
 from mujoco import minimize
 
 from simopt_envs.adaptation.fitting import Noise
+from simopt_envs.gap.chart import Chart
 from simopt_envs.gap.hypothesis import Hypothesis
 from simopt_envs.measured.replay import start_curvature, start_sensitivity
 from simopt_envs.measured.windows import Windows
@@ -23,6 +24,10 @@ from simopt_envs.physics.parameters import Array
 # less tell of one kink and lead a fit astray, those over much lead it across them and past where laws bend.
 DIFFERENCES = (1.0, 0.3, 0.1)
 _KINK = 6.0  # medians: four standard deviations
+_LEAST_GAIN = 1e-4  # share of the loss that a step takes away, below which a fit has arrived
+_BEYOND = np.geomspace(3.0, 3000.0, 7)  # standard deviations from where a fit ended, at which it looks again
+_LOOKS = 3  # at most
+_WORTH_GOING = 1.0  # nats
 _DIVERGED = 30.0  # the error, in units of noise, of a sample that a simulation did not reach
 
 
@@ -147,17 +152,32 @@ class Misfit:
 
     def losses(self, u: Array) -> Array:
         """-log p(u | data) of each u (n, d), up to a constant, (n,)."""
-        data = np.sum(self.errors(u) ** 2, axis=(1, 2, 3))
+        different, of = np.unique(u, axis=0, return_inverse=True)  # many tries end at the same bound
+        data = np.sum(self.errors(different) ** 2, axis=(1, 2, 3))[of]
         return 0.5 * (data + np.sum((u / self.hypothesis.prior_std) ** 2, axis=1))
 
-    def jacobian(self, u: Array, columns: Sequence[int] | None = None, difference: float = DIFFERENCES[-1]) -> Array:
-        """Derivative of the whitened errors by all of u (d,), or some, (m, k), from both sides where bounds allow."""
-        columns = range(len(u)) if columns is None else columns
-        ends = np.tile(u, (2, len(columns), 1))
-        both = np.array([[-difference], [difference]])
-        reached = np.clip(u[columns] + both, self.hypothesis.low[columns], self.hypothesis.high[columns])
+    def jacobian(
+        self,
+        u: Array,
+        columns: Sequence[int] | None = None,
+        difference: float = DIFFERENCES[-1],
+        chart: Chart | None = None,
+    ) -> Array:
+        """Derivative of the whitened errors by all of u (d,), or some, (m, k), from both sides where bounds allow.
+
+        Args:
+            u: where.
+            columns: by which of its coordinates.
+            difference: that it is taken over.
+            chart: in whose coordinates it is taken instead.
+        """
+        chart = Chart(self.hypothesis, ()) if chart is None else chart
+        columns, x = range(len(u)) if columns is None else columns, chart.straight(u)
+        ends = np.tile(x, (2, len(columns), 1))
+        both = np.array([[-difference], [difference]]) * chart.reach(u)[columns]
+        reached = np.clip(x[columns] + both, chart.low[columns], chart.high[columns])
         ends[:, np.arange(len(columns)), columns] = reached
-        below, above = self.errors(ends.reshape(-1, len(u))).reshape(2, len(columns), -1)
+        below, above = self.errors(chart.bent(ends.reshape(-1, len(x)))).reshape(2, len(columns), -1)
         return ((above - below) / np.diff(reached, axis=0).T).T
 
     def noise_at(self, u: Array, scale: Array) -> Noise:
@@ -208,6 +228,10 @@ class _HalfSquares(minimize.Norm):
         return np.einsum("im,mk->ik", columns, r), np.einsum("im,jm->ij", columns, columns)
 
 
+class _NothingLeft(Exception):
+    """Ends a fit at some coordinates."""
+
+
 def fit(
     misfit: Misfit,
     start: Array,
@@ -216,6 +240,9 @@ def fit(
     differences: Sequence[float] = DIFFERENCES,
 ) -> Fit:
     """The most probable u.
+
+    Where it ends, it looks along what the data know least of the effects, near and far, and goes on where that is
+    better: something that catches in one window, at some values alone, makes a wall that no small step gets over.
 
     Args:
         misfit: of a hypothesis.
@@ -227,32 +254,70 @@ def fit(
     """
     hypothesis = misfit.hypothesis
     fresh = list(range(0 if known is None else known.shape[1], len(start)))
-    shape = misfit.errors(start[None]).shape[1:]
+    chart = Chart(hypothesis, fresh)
+    of_effects = [i for i in fresh if i >= hypothesis.num_plain]
 
     def residual(columns: Array) -> Array:
-        u = np.clip(columns.T, hypothesis.low, hypothesis.high)
-        return np.hstack([misfit.errors(u).reshape(len(u), -1), u / hypothesis.prior_std]).T
+        u = chart.bent(columns.T)
+        return np.hstack([misfit.errors(u).reshape(len(u), -1), columns.T * chart.pull]).T
 
-    def jacobian(u: Array, difference: float) -> Array:
-        taken = misfit.jacobian(u, fresh, difference)
-        data = taken if known is None else np.hstack([known, taken])
-        return np.vstack([data, np.diag(1 / hypothesis.prior_std)])
+    def jacobian(x: Array, difference: float) -> Array:
+        taken = misfit.jacobian(chart.bent(x), fresh, difference, chart)
+        return np.vstack([taken if known is None else np.hstack([known, taken]), np.diag(chart.pull)])
 
-    u = np.clip(start, hypothesis.low, hypothesis.high)
+    x = chart.straight(np.clip(start, hypothesis.low, hypothesis.high))
     for difference in differences:
-        u, _ = minimize.least_squares(
-            u,
+        x = _descended(x, residual, partial(jacobian, difference=difference), chart, iterations)
+    rows = jacobian(x, differences[-1])
+    for _ in range(_LOOKS if of_effects and differences[-1] == DIFFERENCES[-1] else 0):
+        ahead = _ahead(x, rows, of_effects)
+        losses = misfit.losses(chart.bent(np.vstack([x, ahead])))
+        best = int(np.argmin(losses))
+        if losses[best] > losses[0] - _WORTH_GOING:
+            break
+        x = ahead[best - 1]
+        x = _descended(x, residual, partial(jacobian, difference=differences[-1]), chart, iterations)
+        rows = jacobian(x, differences[-1])
+    u = chart.bent(x)
+    errors = misfit.errors(u[None])[0]
+    return Fit(u, errors, chart.by_u(rows[: errors.size], u), hypothesis.prior_std)
+
+
+def _descended(
+    x: Array, residual: Callable[[Array], Array], jacobian: Callable[[Array], Array], chart: Chart, iterations: int
+) -> Array:
+    """Where steps downhill lead, with derivatives over one difference."""
+
+    def stop(trace: Sequence[minimize.IterLog]) -> None:
+        # MuJoCo's own test is of steps relative to the length of x: far from 0, where effects are large, it ends early.
+        if trace[-1].reduction < _LEAST_GAIN * trace[-1].objective:
+            raise _NothingLeft(trace[-1].candidate)
+
+    try:
+        x, _ = minimize.least_squares(
+            np.clip(x, chart.low, chart.high),
             residual,
-            bounds=[hypothesis.low, hypothesis.high],
-            jacobian=lambda u, _, difference=difference: jacobian(np.ravel(u), difference),
+            bounds=[chart.low, chart.high],
+            jacobian=lambda x, _: jacobian(np.ravel(x)),
             norm=_HalfSquares(),
-            xtol=1e-2,
             x_scale="jac",  # damping relative to what the data say of each coordinate
             mu_max=1e4,
             mu_factor=10.0,
             max_iter=iterations,
             verbose=minimize.Verbosity.SILENT,
+            iter_callback=stop,
         )
-        u = np.ravel(u)
-    errors = misfit.errors(u[None])[0]
-    return Fit(u, errors.reshape(shape), jacobian(u, differences[-1])[: -len(u)], hypothesis.prior_std)
+    except _NothingLeft as end:
+        x = end.args[0]
+    return np.ravel(x)
+
+
+def _ahead(x: Array, rows: Array, columns: Sequence[int]) -> Array:
+    """Coordinates far along the axes of what is uncertain of some columns, the others as these foretell, (n, d)."""
+    columns_first = np.ascontiguousarray(rows.T)
+    covariance = np.linalg.pinv(np.einsum("im,jm->ij", columns_first, columns_first), hermitian=True)
+    variances, axes = np.linalg.eigh(covariance[np.ix_(columns, columns)])
+    known = variances > 0
+    along = covariance[:, columns] @ (axes[:, known] / np.sqrt(variances[known]))
+    steps = np.concatenate([-_BEYOND, _BEYOND])
+    return x + (steps[:, None, None] * along.T).reshape(-1, len(x))

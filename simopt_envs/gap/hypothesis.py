@@ -139,6 +139,29 @@ class Hypothesis:
         shape = {candidate.full_name(name) for name in candidate.effect.shape}
         return [i for i in self.columns[candidate] if self.space.names[i] not in shape]
 
+    @property
+    def products(self) -> list[tuple[int, int]]:
+        """Columns of a shape in whose product with an amount a law is linear, each with that of the amount."""
+        names = self.space.names
+        return [
+            (names.index(candidate.full_name(lever)), columns[0])
+            for candidate, columns in self.columns.items()
+            for lever in candidate.effect.levers
+        ]
+
+    def reach(self, u: Array) -> Array:
+        """How far a difference of 1 goes along each coordinate at u (d,).
+
+        Of a shape, less far the more there is of its effect: to move the rest position of a spring of 50 probes by a
+        hundredth of the motion changes half as much as a probe does.
+        """
+        reach, neutral = np.ones(len(u)), self.neutral()
+        for candidate, columns in self.columns.items():
+            amounts = self.amounts(candidate)
+            shape = [i for i in columns if i not in amounts]
+            reach[shape] = 1 / np.max(np.abs(u - neutral)[amounts], initial=1.0)
+        return reach
+
     def without(self, candidate: Candidate, u: Array) -> Array:
         """Coordinates (d,) with those of one candidate left out."""
         return np.delete(u, self.columns[candidate])

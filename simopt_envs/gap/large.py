@@ -15,6 +15,7 @@ from simopt_envs.measured.windows import Windows
 from simopt_envs.physics.parameters import Array
 
 _SIZES = np.outer([-1.0, 1.0], [1.0, 3.0, 10.0, 30.0, 100.0, 300.0]).ravel()  # probes
+_SHAPES = 3  # that a fit starts from, as starts alone tell little
 _FINER = np.geomspace([0.4, 0.9], [2.5, 1.1], 9).T  # of the best so far: where things touch, a fit from afar gets stuck
 
 
@@ -36,23 +37,37 @@ def nearest_size(
 
 
 def of_some_size(misfit: Misfit, candidate: Candidate, start: Array) -> Array:
-    """A start (d,) with the candidate at the size, and of the shape, that comes nearest to the data."""
-    return of_fine_size(misfit, candidate, start, of_rough_size(misfit, candidate, start))
+    """Starts (k, d) with the candidate at the size that is nearest to the data, one of each of the nearest shapes."""
+    shapes = _of_each_shape(misfit, candidate, start)
+    return np.array([of_fine_size(misfit, candidate, start, rough) for rough in shapes])
 
 
 def of_rough_size(misfit: Misfit, candidate: Candidate, start: Array) -> Array:
-    """The same, of sizes that are far apart."""
+    """The nearest one (d,), of sizes that are far apart."""
+    return _of_each_shape(misfit, candidate, start)[0]
+
+
+def _of_each_shape(misfit: Misfit, candidate: Candidate, start: Array) -> Array:
+    """The same of each probe, of those that come nearest, (k, d), nearest first."""
     hypothesis = misfit.hypothesis
     probes = hypothesis.probes(candidate)
     others = np.setdiff1d(np.arange(len(start)), hypothesis.columns[candidate])
     probes[:, others] = start[others]
-    return misfit.best(_scaled(hypothesis, candidate, start, probes, _SIZES))
+    tried = np.array([_scaled(hypothesis, candidate, start, probe, _SIZES) for probe in probes])
+    return best_of_each(misfit, tried)
+
+
+def best_of_each(misfit: Misfit, starts: Array) -> Array:
+    """The best starts of the sets that have the best ones, (k, d), best first, of several sets, (n, m, d)."""
+    losses = misfit.losses(np.concatenate(starts)).reshape(starts.shape[:2])
+    best = starts[np.arange(len(starts)), np.argmin(losses, axis=1)]
+    return best[np.argsort(losses.min(axis=1), kind="stable")[:_SHAPES]]
 
 
 def of_fine_size(misfit: Misfit, candidate: Candidate, start: Array, rough: Array) -> Array:
     """The same, of sizes near a rough one (d,)."""
     for sizes in _FINER:
-        rough = misfit.best(_scaled(misfit.hypothesis, candidate, start, rough[None], sizes))
+        rough = misfit.best(_scaled(misfit.hypothesis, candidate, start, rough, sizes))
     return rough
 
 
@@ -70,8 +85,8 @@ def of_several_effects(ordered: Sequence[Candidate]) -> list[Candidate]:
 
 
 def _scaled(hypothesis: Hypothesis, candidate: Candidate, start: Array, tried: Array, sizes: Array) -> Array:
-    """Each of some coordinates (k, d) with so many times its amount of the effect, (sizes k, d)."""
+    """Some coordinates (d,) with so many times their amount of the effect, (sizes, d)."""
     amounts = hypothesis.amounts(candidate)
-    out = np.tile(tried, (len(sizes), 1, 1))
-    out[..., amounts] = start[amounts] + sizes[:, None, None] * (tried[:, amounts] - start[amounts])
-    return np.clip(out.reshape(-1, len(start)), hypothesis.low, hypothesis.high)
+    out = np.tile(tried, (len(sizes), 1))
+    out[:, amounts] = start[amounts] + sizes[:, None] * (tried[amounts] - start[amounts])
+    return np.clip(out, hypothesis.low, hypothesis.high)

@@ -71,7 +71,7 @@ class Score:
 
 
 def chosen(null: Base, base: Base, scores: Sequence[Score]) -> Score | None:
-    """The candidate to add: the simplest of those that the best does not beat clearly on held-out data.
+    """The candidate to add: the simplest of those that the best does not beat clearly.
 
     A law of slightly another form than the true one leaves an error that nothing in the library describes, but much of
     it bends a little. So a further effect must make the model right, to what noise is, or explain a share of what the
@@ -97,11 +97,7 @@ def chosen(null: Base, base: Base, scores: Sequence[Score]) -> Score | None:
         return SIMPLER if alone_right else max(SIMPLER, FURTHER * best.held_out)
 
     as_good = [
-        s
-        for s in earned
-        if best.held_out - s.held_out < clearly(s)
-        or best.total - s.total < clearly(s)
-        or enough > s.trial.excess > best.trial.excess > right
+        s for s in earned if best.total - s.total < clearly(s) or enough > s.trial.excess > best.trial.excess > right
     ]
     return min(as_good, key=lambda score: (len(score.trial.fit.u), -score.total))
 

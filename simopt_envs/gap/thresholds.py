@@ -25,7 +25,7 @@ EXPLAINED = 1.25
 """Mean square of the whitened errors up to which a model counts as right; noise alone leaves 1."""
 
 SIMPLER = 5.0
-"""Nats by which a candidate with more parameters must win, held out and in all, over one with fewer; or, where that is
+"""Nats by which a candidate with more parameters, whose price is paid, must win over one with fewer; or, where that is
 more, the share ``FURTHER`` of what it gains on held-out data."""
 
 SIMPLER_SHARE = 0.8

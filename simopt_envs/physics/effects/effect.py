@@ -43,12 +43,14 @@ class Effect(ABC):
         name: as in reports and in ``gap.json``.
         law: one line, as a person would write it.
         shape: those of its parameters that say what it is like, not how much of it there is.
+        levers: those of its shape in whose product with its amount, its first parameter, the law is linear.
         of_reading: whether it is about what recordings show of its place, which must then be among their columns.
     """
 
     name: ClassVar[str]
     law: ClassVar[str]
     shape: ClassVar[tuple[str, ...]] = ()
+    levers: ClassVar[tuple[str, ...]] = ()
     of_reading: ClassVar[bool] = False
 
     @abstractmethod

@@ -22,7 +22,7 @@ class JointSpring(Effect):
 
     name = "joint_spring"
     law = "f = -k (q - q_ref)"
-    shape = ("reference",)
+    shape = levers = ("reference",)
 
     def places(self, model: mujoco.MjModel) -> tuple[str, ...]:
         """See :meth:`Effect.places`."""

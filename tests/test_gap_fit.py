@@ -1,0 +1,104 @@
+"""Fits of hypotheses: coordinates in which laws are linear, differences that fit an effect's size, ways over walls."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from conftest import needs_effects
+from gap_plant import MODEL, record
+
+from simopt_envs.gap import fit as fits
+from simopt_envs.gap.chart import Chart
+from simopt_envs.gap.hypothesis import Candidate, Hypothesis
+from simopt_envs.gap.motion import motion_of
+from simopt_envs.gap.plain import plain_parameters
+from simopt_envs.gap.recordings import read_windows
+from simopt_envs.physics.effects import EFFECTS
+from simopt_envs.physics.effects.joint_spring import JointSpring
+
+pytestmark = needs_effects
+
+SPRING = Candidate(EFFECTS["joint_spring"], "joint:shoulder")
+STIFFNESS, REST = 12.0, -1.5
+
+
+@pytest.fixture(scope="module")
+def arm():
+    """An arm whose shoulder a spring pulls far away, and its windows."""
+    plain = plain_parameters(mujoco.MjSpec.from_string(MODEL))
+    recordings = record(lambda q, v: np.array([-STIFFNESS * (q[0] - REST), 0.0]), np.random.default_rng(0))
+    motion = motion_of(plain.model, recordings)
+    hypothesis = Hypothesis(plain, [SPRING], motion)
+    return hypothesis, fits.Misfit(hypothesis, read_windows(plain.model, recordings).fitted)
+
+
+def _at(hypothesis: Hypothesis, stiffness: float, reference: float) -> np.ndarray:
+    values = {SPRING.full_name("stiffness"): stiffness, SPRING.full_name("reference"): reference}
+    u = hypothesis.coordinates(hypothesis.space.values(values))
+    u[: hypothesis.num_plain] = 0.0
+    return u
+
+
+def test_coordinates_of_a_chart_mean_the_same(arm):
+    hypothesis, _ = arm
+    chart = Chart(hypothesis, range(len(hypothesis.space)))
+    u = np.array([_at(hypothesis, 12.0, -1.5), _at(hypothesis, 0.5, 3.0)])
+    x = chart.straight(u)
+    assert np.all(np.abs(x - u).max(axis=1) > 0.1)
+    np.testing.assert_allclose(chart.bent(x), u, rtol=1e-12)
+    np.testing.assert_array_equal(Chart(hypothesis, ()).straight(u), u)
+
+
+def test_derivatives_by_a_chart_are_those_by_u(arm):
+    hypothesis, misfit = arm
+    u, chart = _at(hypothesis, 12.0, -1.5), Chart(hypothesis, range(len(hypothesis.space)))
+    by_x = misfit.jacobian(u, difference=1e-3, chart=chart)
+    by_u = misfit.jacobian(u, difference=1e-3)
+    np.testing.assert_allclose(chart.by_u(by_x, u), by_u, atol=1e-4 * np.abs(by_u).max())
+
+
+def test_differences_in_a_shape_shrink_with_the_amount_of_its_effect(arm):
+    hypothesis, _ = arm
+    _, reference = hypothesis.columns[SPRING]
+    weak, strong = (hypothesis.reach(_at(hypothesis, k, -1.5)) for k in (1e-3, 60.0))
+    assert weak[reference] == 1.0
+    amount = _at(hypothesis, 60.0, -1.5)[hypothesis.columns[SPRING][0]]
+    assert strong[reference] == pytest.approx(1 / amount)
+    assert np.all(np.delete(strong, reference) == 1.0)
+
+
+@pytest.mark.parametrize(("levers", "right"), [(("reference",), True), ((), False)])
+def test_a_spring_that_is_taken_for_a_stiffer_one_is_found(arm, monkeypatch, levers, right):
+    """A spring of thrice the stiffness that pulls as hard in the middle; in its own coordinates the fit ends early."""
+    monkeypatch.setattr(JointSpring, "levers", levers)
+    hypothesis, misfit = arm
+    start = _at(hypothesis, 3 * STIFFNESS, 0.3 + (REST - 0.3) / 3)
+    misfit = misfit.with_noise(misfit.noise_at(start, np.array([5e-4, 5e-4, 1e-3, 1e-3, 1e-3])))
+    found = fits.fit(misfit, start, 5, differences=(0.3,))
+    stiffness = hypothesis.values(SPRING, hypothesis.xi(found.u[None])[0])["stiffness"]
+    assert (stiffness == pytest.approx(STIFFNESS, rel=0.05)) == right, stiffness
+
+
+@pytest.mark.parametrize("looks", [3, 0])
+def test_a_fit_looks_beyond_a_wall(monkeypatch, looks):
+    """Errors that fall by steps of 2, but for a wall from 10 to 14, as of a window in which something catches."""
+    monkeypatch.setattr(fits, "_LOOKS", looks)
+    bounds = np.full(1, 100.0)
+    hypothesis: Any = SimpleNamespace(
+        num_plain=0, low=-bounds, high=bounds, prior_std=bounds, products=[], reach=np.ones_like
+    )
+    misfit = object.__new__(fits.Misfit)
+    misfit.hypothesis = hypothesis
+    samples = np.linspace(-1.0, 1.0, 20)
+
+    def errors(u: np.ndarray) -> np.ndarray:
+        wall = np.where((u > 10) & (u < 14), 3.0, 0.0)
+        return (300 * np.exp(-u / 2) * samples + wall).reshape(-1, 1, 20, 1)
+
+    monkeypatch.setattr(misfit, "errors", errors)
+    (end,) = fits.fit(misfit, np.array([4.0]), 20).u
+    assert (end > 14) == (looks > 0), end
