@@ -14,6 +14,7 @@ from gap_plant import MODEL, record
 from simopt_envs.gap import fit as fits
 from simopt_envs.gap.chart import Chart
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
+from simopt_envs.gap.large import of_some_size
 from simopt_envs.gap.motion import motion_of
 from simopt_envs.gap.plain import plain_parameters
 from simopt_envs.gap.recordings import read_windows
@@ -81,6 +82,16 @@ def test_a_spring_that_is_taken_for_a_stiffer_one_is_found(arm, monkeypatch, lev
     found = fits.fit(misfit, start, 5, differences=(0.3,))
     stiffness = hypothesis.values(SPRING, hypothesis.xi(found.u[None])[0])["stiffness"]
     assert (stiffness == pytest.approx(STIFFNESS, rel=0.05)) == right, stiffness
+
+
+def test_a_large_effect_is_tried_in_each_shape_at_the_size_that_this_needs(arm):
+    hypothesis, misfit = arm
+    found = of_some_size(misfit, SPRING, hypothesis.neutral())
+    nearest, *others = (hypothesis.values(SPRING, xi) for xi in hypothesis.xi(found))
+    assert len({spring["reference"] for spring in (nearest, *others)}) == 3
+    # The true one rests far below where the arm moves; one that rests nearer must be stiffer to pull as hard.
+    assert all(REST < nearest["reference"] < other["reference"] for other in others)
+    assert nearest["stiffness"] > STIFFNESS
 
 
 @pytest.mark.parametrize("looks", [3, 0])

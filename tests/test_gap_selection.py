@@ -95,6 +95,14 @@ def test_a_simpler_law_is_no_other_form_of_one_that_alone_makes_the_model_right(
     assert chosen(null, null, scores) is scores[simple_wins]
 
 
+@pytest.mark.parametrize(("fitted", "simple_wins"), [(15.0, False), (23.0, True)])
+def test_a_simpler_law_gives_way_by_all_that_the_data_say(fitted, simple_wins):
+    """A spring that earns 25 + 23 nats, its two numbers paid for, and a sensor's scale that earns as many held out."""
+    null: Any = SimpleNamespace(excess=0.1)
+    scores = [_score(5, 0.0, 23.0, 25.0), _score(4, 0.01, 21.0, fitted)]
+    assert chosen(null, null, scores) is scores[simple_wins]
+
+
 @pytest.mark.parametrize(
     ("null", "final", "verdict"),
     [
