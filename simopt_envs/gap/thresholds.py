@@ -12,7 +12,8 @@ all intervals, is asked of what is named as well since seeds 8000 had been run; 
 9000 had; and ``BENT`` and ``WILD`` are asked of two standard errors of a start, too, since seeds 10000 had (two was
 set on one case of these). Since then, too, ``LEAST_SHARE`` is not asked of effects that make the median window right
 (one case), and the share ``FURTHER`` of what the best gains excuses none that leaves more than noise where the best
-does not (seed 1 of the gap demonstration).
+does not (seed 1 of the gap demonstration). ``SIMPLER`` is asked of all nats alone, not of those held out too, since
+seeds 11000 had been run.
 """
 
 EVIDENCE = 20.0
