@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from simopt_envs.adaptation.checkpoint import Result
+from simopt_envs.adaptation.fitting import Noise
 from simopt_envs.engine import Engine, LocalEngine
 from simopt_envs.gap.explanation import Explanation, Stage, ranked, stage_of
 from simopt_envs.gap.fit import DIFFERENCES, Fit, Misfit, fit
@@ -273,7 +274,7 @@ class Search:
 
     def trials(self, base: Base, refits: Sequence[Refit]) -> dict[Candidate, Trial]:
         """Candidates fitted, each together with all that the base has."""
-        keys = [self._key(r.screened.hypothesis, base.fit.u, base.noise.scale, *r.starts) for r in refits]
+        keys = [self._key(r.screened.hypothesis, base.noise, base.fit.u, *r.starts) for r in refits]
         todo = [i for i, key in enumerate(keys) if not self._kept.has(key)]
         done = itertools.count(len(refits) - len(todo) + 1)
         self._progress("refit", len(refits) - len(todo), len(refits))
@@ -294,11 +295,12 @@ class Search:
 
     def _fit(self, misfit: Misfit, start: Array, differences: Sequence[float]) -> Fit:
         """A fit of all parameters."""
-        key = self._key(misfit.hypothesis, start, misfit.noise.scale, np.array(differences))
+        key = self._key(misfit.hypothesis, misfit.noise, start, np.array(differences))
         return Fit(**self._kept.phase(key, lambda: vars(fit(misfit, start, ITERATIONS, differences=differences))))
 
-    def _key(self, hypothesis: Hypothesis, *given: Array) -> str:
-        return key_of(hypothesis, np.array(self.data.fitted.measured.shape), *given)
+    def _key(self, hypothesis: Hypothesis, noise: Noise, *given: Array) -> str:
+        """A fit's name; of the noise of starts, what tells one from another is enough."""
+        return key_of(hypothesis, np.array(self.data.fitted.measured.shape), noise.scale, noise.shrink, *given)
 
     def _spoken_for(self, base: Base) -> dict[Candidate, Array]:
         """The candidates that plain parameters far outside their priors speak for; a linear screen cannot tell them.
