@@ -20,7 +20,7 @@ Kind = Literal["single", "null", "outside", "double"]
 KINDS: tuple[Kind, ...] = ("single", "null", "outside", "double")
 FIRST_SEED = {"dev": 0, "test": 13000}
 """Split -> its first seed. Seeds from 1000, 2000, ... 12000 on were earlier test splits, run before the workflow was
-changed again, so they count as seen (from 11000 on with commit 911f320, from 12000 on 37 with 879f229)."""
+changed again, so they count as seen (from 11000 on with commit 911f320, from 12000 on with 879f229)."""
 LEVELS = (10.0, 3.0)
 """Magnitudes of single effects, in least detectable ones."""
 _OF_TRANSMISSION = {"backlash", "joint_elasticity"}  # a joint has one, which the law of either replaces
