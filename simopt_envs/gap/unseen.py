@@ -44,6 +44,7 @@ class UnseenJoints:
             return
         self._model, self._data, self._nominal = copy.copy(model), mujoco.MjData(model), space.nominal
         self._writer = ModelWriter(self._model, space)
+        self._starts, self._told = windows.starts, self._tell(windows.starts)
 
     def __bool__(self) -> bool:
         return bool(len(self._dofs) and self._columns)
@@ -58,12 +59,7 @@ class UnseenJoints:
             of_model: the places of the model's parameters in it.
             shown_by: what columns show.
         """
-        self._writer.write_model(self._nominal, self._model, self._data)
-        shown = np.array([self._read(start) for start in starts.qpos])
-        rates = np.array([self._rate(*start) for start in zip(starts.qpos, starts.qvel, strict=True)])
-        units = np.eye(self._model.nv)[self._dofs]
-        by_joint = np.array([[self._rate(start, unit) for unit in units] for start in starts.qpos])
-        gains = np.linalg.pinv(by_joint.transpose(0, 2, 1), rcond=1e-6)
+        shown, rates, gains = self._told if starts is self._starts else self._tell(starts)
         meant = np.stack(
             [shown_by.meant(c, xi, *told) for c, *told in zip(self._columns, shown.T, rates.T, strict=True)], axis=-1
         )
@@ -76,6 +72,15 @@ class UnseenJoints:
                     if np.max(np.abs(tangent)) < _EXACT:
                         break
                     mujoco.mj_integratePos(self._model, posture, tangent, 1.0)
+
+    def _tell(self, starts: States) -> tuple[Array, Array, Array]:
+        """What columns show without the effect, (w, c), its rates, and how joints follow from it, (w, joints, c)."""
+        self._writer.write_model(self._nominal, self._model, self._data)
+        shown = np.array([self._read(start) for start in starts.qpos])
+        rates = np.array([self._rate(*start) for start in zip(starts.qpos, starts.qvel, strict=True)])
+        units = np.eye(self._model.nv)[self._dofs]
+        by_joint = np.array([[self._rate(start, unit) for unit in units] for start in starts.qpos])
+        return shown, rates, np.linalg.pinv(by_joint.transpose(0, 2, 1), rcond=1e-6)
 
     def _read(self, qpos: Array) -> Array:
         return read_state(self._model, self._data, qpos, np.zeros(self._model.nv), self._channels)

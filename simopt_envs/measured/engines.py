@@ -26,6 +26,7 @@ class BatchEngine:
     def __init__(self, model: mujoco.MjModel, space: ParameterSpace, windows: Windows, num_threads: int):
         self._model, self._windows, self._num_threads = model, windows, num_threads
         self._writer = ModelWriter(model, space)
+        self._settled = _settled_starts(model, windows)
         self._grow(1)
 
     def _grow(self, num_xi: int) -> None:
@@ -50,7 +51,7 @@ class BatchEngine:
         if self._writer.needs_set_const:
             batch.set_const(worlds)
         batch.reset(worlds, stage=int(mujoco.mjtStage.mjSTAGE_NONE))
-        for field, values in _initial_fields(self._model, windows, starts).items():
+        for field, values in _initial_fields(self._model, windows, starts, self._settled).items():
             batch.bind(field)[worlds] = values
         # One step more than the window is long: derived fields lag the state by a step.
         commands = np.concatenate([commands, commands[:, -1:]], axis=1)
@@ -81,6 +82,7 @@ class RolloutEngine:
     def __init__(self, model: mujoco.MjModel, space: ParameterSpace, windows: Windows, num_threads: int):
         self._model, self._windows = model, windows
         self._writer = ModelWriter(model, space)
+        self._settled = _settled_starts(model, windows)
         self._data = [mujoco.MjData(model) for _ in range(num_threads or os.cpu_count() or 1)]
 
     def run(self, xi: Array, starts: States, commands: Array) -> Array:
@@ -91,7 +93,7 @@ class RolloutEngine:
         models = [copy.copy(model) for _ in xi]
         for values, world in zip(xi, models, strict=True):
             self._writer.write_model(values, world, self._data[0])
-        initial = _initial_states(model, windows, starts)
+        initial = _initial_states(model, windows, starts, self._settled)
         commands = np.concatenate([commands, commands[:, -1:]], axis=1)
         states, sensors = rollout.rollout(
             [world for world in models for _ in range(len(windows))],
@@ -138,19 +140,33 @@ def _site_positions(model: mujoco.MjModel, data: mujoco.MjData, qpos: Array) -> 
     return positions
 
 
-def _initial_fields(model: mujoco.MjModel, windows: Windows, starts: States) -> dict[str, Array]:
-    """The state fields to write at the starts, name -> (n w, ...)."""
-    fields = {"qpos": starts.qpos, "qvel": starts.qvel}
-    if not (model.na or model.nhistory):
-        return fields
+def _settled_starts(model: mujoco.MjModel, windows: Windows) -> dict[str, Array] | None:
+    """Activations and delays at the starts of windows, name -> (w, ...); None if they depend on where joints are."""
+    if mujoco.mjtDyn.mjDYN_INTEGRATOR in model.actuator_dyntype:
+        return None
+    return _settled(model, windows, windows.starts)
+
+
+def _settled(model: mujoco.MjModel, windows: Windows, starts: States) -> dict[str, Array]:
+    """The same at other starts, name -> (n w, ...)."""
     data = mujoco.MjData(model)
     act, history = np.zeros((len(starts), model.na)), np.zeros((len(starts), model.nhistory))
-    for i in range(len(starts)):
+    for i in range(len(starts) if model.na or model.nhistory else 0):
         mujoco.mj_resetData(model, data)
         data.qpos[:], data.qvel[:] = starts.qpos[i], starts.qvel[i]
         settle_actuators(model, data, windows.past_commands[i % len(windows)])
         act[i], history[i] = data.act, data.history
-    return fields | ({"act": act} if model.na else {}) | ({"history": history} if model.nhistory else {})
+    return ({"act": act} if model.na else {}) | ({"history": history} if model.nhistory else {})
+
+
+def _initial_fields(
+    model: mujoco.MjModel, windows: Windows, starts: States, settled: dict[str, Array] | None
+) -> dict[str, Array]:
+    """The state fields to write at the starts, name -> (n w, ...)."""
+    fields = {"qpos": starts.qpos, "qvel": starts.qvel}
+    if settled is None:
+        return fields | _settled(model, windows, starts)
+    return fields | {name: np.tile(values, (len(starts) // len(windows), 1)) for name, values in settled.items()}
 
 
 def settle_actuators(model: mujoco.MjModel, data: mujoco.MjData, past: Array) -> None:
@@ -175,11 +191,11 @@ def settle_actuators(model: mujoco.MjModel, data: mujoco.MjData, past: Array) ->
             mujoco.mj_initCtrlHistory(model, data, i, times, np.ascontiguousarray(past[-length:, i, None]))
 
 
-def _initial_states(model: mujoco.MjModel, windows: Windows, starts: States) -> Array:
+def _initial_states(model: mujoco.MjModel, windows: Windows, starts: States, settled: dict[str, Array] | None) -> Array:
     """Full physics states (n w, ...) at the starts."""
     spec = mujoco.mjtState.mjSTATE_FULLPHYSICS
     data, rows = mujoco.MjData(model), np.empty((len(starts), mujoco.mj_stateSize(model, spec)))
-    fields = _initial_fields(model, windows, starts)
+    fields = _initial_fields(model, windows, starts, settled)
     for i, row in enumerate(rows):
         for field, values in fields.items():
             getattr(data, field)[:] = values[i]
