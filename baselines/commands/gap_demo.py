@@ -34,6 +34,7 @@ HIDDEN: tuple[Mapping[str, Any], ...] = (
 _NOISE = 0.002  # rad, m
 _ROLLOUTS = 3  # measured per iteration
 _ENOUGH = 0.9
+_ITERATIONS = 3  # in the repaired environment, at most; alone SimOpt has one, as more cure nothing
 _LEAST_STD = 0.02  # of a new parameter's value
 
 
@@ -60,7 +61,7 @@ class GapDemo:
         display.say(f"{ENV_ID}: the target has what no parameter of the simulation stands for: {told_effect(hidden)}")
         simulator = EnvSimulator(ENV_ID)
         prior = inputs.distribution(ENV_ID, simulator.parameters, ())
-        first, alone = self._adapt(simulator, prior, robot, self.out)
+        first, alone = self._adapt(simulator, prior, robot, self.out, iterations=1)
 
         # The rollouts that SimOpt adapted to, in vain, and those that showed it.
         logs = dict.fromkeys(robot.log(trajectory) for step in (first, alone) for trajectory in step.real)
@@ -70,7 +71,7 @@ class GapDemo:
             return
         repaired = EnvSimulator(with_effects(ENV_ID, effects))
         joined = _joined(prior, repaired.parameters, effects)
-        *_, after = self._adapt(repaired, joined, robot, self.out / "repaired", alone)
+        _, after = self._adapt(repaired, joined, robot, self.out / "repaired", _ITERATIONS, alone)
         for label, step in (
             ("trained in simulation", first),
             ("adapted by SimOpt alone", alone),
@@ -85,9 +86,10 @@ class GapDemo:
         distribution: Gaussian,
         robot: LoggedSystem,
         directory: Path,
+        iterations: int,
         start: Iteration | None = None,
     ) -> tuple[Iteration, Iteration]:
-        """SimOpt for one iteration, unless its first policy works; the first and the last iteration."""
+        """SimOpt until its policy works, for so many iterations at most; the first and the last iteration."""
         display = Display()
         loop = SimOpt(
             simulator,
@@ -108,7 +110,7 @@ class GapDemo:
             return (step.target_success or 0.0) >= _ENOUGH
 
         details = Details(self.typed, ENV_ID, control_period(ENV_ID), {})
-        run_loop(loop, 1, display, details, self.typed, resume=True, enough=enough)
+        run_loop(loop, iterations, display, details, self.typed, resume=True, enough=enough)
         return steps[0], steps[-1]
 
     def _missing(self, prior: Gaussian, logs: Sequence[Path], display: Display) -> list[dict[str, Any]]:
