@@ -144,6 +144,20 @@ def test_delayed_commands_of_before_a_window_still_act_in_it(engine):
 
 
 @pytest.mark.parametrize("engine", ENGINES)
+def test_an_integrated_setpoint_begins_where_the_joint_is_from_any_start(engine):
+    """A servo told to stand still holds a cart wherever it is; one that remembered the windows' start would pull."""
+    servo = '<intvelocity name="push" joint="slide" kp="50" kv="20" actrange="-9 9"/>'
+    driven = CART.replace('<motor name="push" joint="slide" delay="0.006" nsample="5"/>', servo)
+    model = mujoco.MjModel.from_xml_string(driven.format(armature=""))
+    time = 0.002 * np.arange(200)
+    columns = dict.fromkeys(("ctrl/push", "ctrl/servo", "qpos/slide", "qpos/hinge"), 0.0 * time)
+    windows = cut_windows(model, Recording(time, columns), 0.2)
+    moved = replace(windows.starts, qpos=windows.starts.qpos + np.array([0.5, 0.0]))
+    simulated = engine(model, ParameterSpace(()), windows, 1).run(np.zeros((1, 0)), moved, windows.commands)[0]
+    np.testing.assert_allclose(simulated[..., windows.names.index("qpos/slide")], 0.5, atol=1e-3)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
 def test_many_parameter_vectors_at_once_are_each_as_alone(engine):
     model = cart()
     recording, *_ = record(model, 600)
