@@ -285,6 +285,15 @@ def test_a_friction_that_pushes_is_no_asymmetric_friction(level: float, differen
     assert EFFECTS["asymmetric_friction"].is_itself(model, "joint:drive", MOTION, values) is is_itself
 
 
+@pytest.mark.parametrize(
+    ("rest", "is_itself"), [(0.0, True), (0.8, True), (-2.3, True), (2.3, True), (-2.5, False), (2.5, False)]
+)
+def test_a_spring_that_rests_far_from_where_its_joint_moves_is_a_constant_force(rest: float, is_itself: bool) -> None:
+    model = mujoco.MjModel.from_xml_string(ARM)
+    values = {"stiffness": 1.0, "reference": rest}
+    assert EFFECTS["joint_spring"].is_itself(model, "joint:drive", MOTION, values) is is_itself
+
+
 def test_stribeck_friction_has_its_peak_at_low_speed() -> None:
     def push(t: float) -> float:
         return 8.0 - 5.0 * t

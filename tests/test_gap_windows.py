@@ -16,10 +16,11 @@ from simopt_envs.gap.fit import Misfit, by_part
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
 from simopt_envs.gap.motion import motion_of
 from simopt_envs.gap.plain import Plain, plain_parameters
-from simopt_envs.gap.recordings import read_windows, whole_recordings, without_wild_starts
+from simopt_envs.gap.recordings import read_windows, whole_recordings
 from simopt_envs.gap.search import Search
 from simopt_envs.gap.thresholds import BENT, FORGOTTEN, WILD
 from simopt_envs.gap.trial import Data
+from simopt_envs.gap.wild_starts import without_wild_starts
 from simopt_envs.measured import Recording, WindowSimulator, cut_windows
 from simopt_envs.measured.replay import start_curvature
 from simopt_envs.measured.windows import Windows
@@ -222,7 +223,7 @@ def test_a_search_never_leaves_out_more_than_half_of_its_windows_however_often_a
 
     plain, windows, recordings = of_pushed_rods([3.0, 3.1, 3.2, 3.3])
     data = Data(windows, windows, recordings, recordings)
-    monkeypatch.setattr("simopt_envs.gap.search.without_wild_starts", one_fewer)
+    monkeypatch.setattr("simopt_envs.gap.wild_starts.without_wild_starts", one_fewer)
     found = Search(plain, data, motion_of(plain.model, recordings), (BIAS,)).run()
     assert (len(found.data.fitted), len(found.data.held_out)) == (kept, kept)
 

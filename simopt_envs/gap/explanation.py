@@ -28,6 +28,11 @@ class Stage:
     screened: tuple[Screened, ...]
     scores: tuple[Score, ...]
 
+    @property
+    def trials(self) -> dict[Candidate, Trial]:
+        """Those that were fitted."""
+        return {score.candidate: score.trial for score in self.scores}
+
     def rivals(self, effect: Candidate) -> set[Candidate]:
         """The other candidates that do nearly as much as the one that was taken, or more."""
         total = {score.candidate: score.total for score in self.scores}

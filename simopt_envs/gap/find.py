@@ -22,11 +22,12 @@ from simopt_envs.gap.hypothesis import Candidate, Hypothesis
 from simopt_envs.gap.localise import localise
 from simopt_envs.gap.motion import motion_of
 from simopt_envs.gap.plain import Plain, plain_parameters
-from simopt_envs.gap.recordings import read_windows, whole_recordings, without_wild_starts
+from simopt_envs.gap.recordings import read_windows, whole_recordings
 from simopt_envs.gap.result import Gap, judge, named_effects, repair
 from simopt_envs.gap.search import Progress, Search
 from simopt_envs.gap.separate import separate
 from simopt_envs.gap.trial import Base, Data
+from simopt_envs.gap.wild_starts import without_wild_starts
 from simopt_envs.measured.mapping import LogMapping
 from simopt_envs.measured.readers import load_recordings
 from simopt_envs.measured.recording import Recording

@@ -9,15 +9,12 @@ from functools import partial
 import mujoco
 import numpy as np
 
-from simopt_envs.gap.fit import Misfit
-from simopt_envs.gap.hypothesis import Hypothesis
-from simopt_envs.gap.thresholds import LONG_WINDOW, WILD, WINDOW
+from simopt_envs.gap.thresholds import LONG_WINDOW, WINDOW
 from simopt_envs.gap.trial import Data
 from simopt_envs.measured.audit import audited
 from simopt_envs.measured.recording import Finding, Recording, warnings_of
 from simopt_envs.measured.windows import Windows, cut_windows
 from simopt_envs.physics.effects.actuator_delay import LONGEST
-from simopt_envs.physics.parameters import Array
 
 _GUARD = 0.5  # seconds between what is fitted of a single recording and what is held out
 _FITTED = 0.6  # share of a single recording that is fitted
@@ -76,36 +73,6 @@ def read_windows(model: mujoco.MjModel, recordings: Sequence[Recording], keyfram
         tuple(held_out),
         warnings,
     )
-
-
-def without_wild_starts(hypothesis: Hypothesis, u: Array, data: Data, scale: Array, beyond: float = 0.0) -> Data:
-    """Without the windows in which the start decides: those where its error, beyond the linear, makes more than noise.
-
-    A finger that just catches or just slips leaves hundreds of times the noise in the right model too, and one such
-    window would bend all plain parameters. Where it is more than half of the windows, all stay.
-
-    Args:
-        hypothesis: by which windows are judged.
-        u: its coordinates, (d,).
-        data: the windows.
-        scale: standard deviation of each channel's noise, (c,).
-        beyond: times what it leaves of the median window, that it must leave of one that is left out, or that the start
-            could make of it.
-    """
-    kept = []
-    for windows in (data.fitted, data.held_out):
-        misfit = Misfit(hypothesis, windows)
-        left = np.mean(misfit.with_noise(misfit.noise_at(u, scale)).errors(u[None])[0] ** 2, axis=(1, 2))
-        bent = misfit.bent_by_starts(u, scale)
-        wild = (bent > WILD) & (np.maximum(left, bent) > beyond * np.median(left))
-        kept.append(windows if np.mean(wild) > 0.5 else windows.select(np.flatnonzero(~wild)))
-    total = len(data.fitted) + len(data.held_out)
-    left_out = total - sum(map(len, kept))
-    if left_out == 0:
-        return data
-    message = f"{left_out} of {total} left out, where all depends on how exactly they start"
-    warning = Finding.warning("windows", "start", message)
-    return replace(data, fitted=kept[0], held_out=kept[1], warnings=(*data.warnings, warning))
 
 
 def whole_recordings(model: mujoco.MjModel, data: Data, keyframe: str | None = None) -> Data | None:

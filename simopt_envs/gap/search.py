@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -19,7 +20,6 @@ from simopt_envs.gap.kept import kept_fits, key_of
 from simopt_envs.gap.large import nearest_size, of_several_effects
 from simopt_envs.gap.plain import SPEAKS_FOR, Plain
 from simopt_envs.gap.predictive import HeldOut
-from simopt_envs.gap.recordings import without_wild_starts
 from simopt_envs.gap.refit import ITERATIONS, Refit, fitted
 from simopt_envs.gap.screen import Screened, screen
 from simopt_envs.gap.selection import Score, chosen, score_of, tolerance_of, worth_of
@@ -33,11 +33,11 @@ from simopt_envs.gap.thresholds import (
     LARGE,
     LARGE_REFITTED,
     MOST_EFFECTS,
-    OUTLYING,
     REFITTED,
     REFITTED_AT_MOST,
 )
-from simopt_envs.gap.trial import Base, Data, Trial, of_median_window
+from simopt_envs.gap.trial import Base, Data, Trial, afresh
+from simopt_envs.gap.wild_starts import without_starts_told_wild
 from simopt_envs.physics.effects import Motion
 from simopt_envs.physics.parameters import Array
 
@@ -97,11 +97,7 @@ class Search:
         if self._whole is not None and self._predicts(base, self._whole):
             self.data = self._whole
             base = self.base(start=base.fit.u)
-        stage = self.stage(base)
-        if (data := self._without_wild_starts(stage)) is not self.data:
-            self.data = data
-            self._largest.clear()
-            stage = self.stage(self.base())
+        stage = self._first(base)
         self._tolerance = tolerance_of(min((score.trial for score in stage.scores), key=lambda trial: trial.excess))
         if np.any(self._tolerance > 1):  # only now it is known that nothing comes near the sensors' noise
             stage = self.stage(self.base(start=self._led_to(stage)))
@@ -132,28 +128,24 @@ class Search:
                 return False
         return True
 
-    def _without_wild_starts(self, stage: Stage) -> Data:
-        """Without those that a candidate tells which explains the median window, where the base is far from that.
+    def _first(self, base: Base) -> Stage:
+        """The first stage, on windows whose start does not decide.
 
-        What the candidate leaves of the others then counts little, but a fit to all has been bent by it, so it is
-        fitted anew, from where that bent nothing, until it tells of no more. An effect that acts in few windows alone
-        leaves the base near to the median one, and so leaves all windows where they are; so does a candidate that
-        would leave out more than half of them.
+        Where the base is far from the data, the few candidates that come nearest at some size may tell of such windows
+        before all others are fitted.
         """
-        base, data = stage.base, self.data
-        nearest = min((score.trial for score in stage.scores), key=lambda trial: of_median_window(trial.fit.errors))
-        if of_median_window(base.fit.errors) < LARGE * max(of_median_window(nearest.fit.errors), 1.0):
-            return data
-        hypothesis, u = nearest.hypothesis, nearest.fit.u
-        while (fewer := without_wild_starts(hypothesis, u, data, base.sensor_noise, OUTLYING)) is not data:
-            data = fewer
-            pairs = (self.data.fitted, data.fitted), (self.data.held_out, data.held_out)
-            if any(2 * len(left) < len(windows) for windows, left in pairs):
-                return self.data
-            misfit = Misfit(hypothesis, data.fitted)
-            misfit = misfit.with_noise(misfit.noise_at(u, base.sensor_noise))
-            u = fit(misfit, _afresh(nearest), ITERATIONS).u
-        return data
+        look = self._look(base) if base.excess >= LARGE else None
+        if look is not None and self._left_out(look):
+            return self.stage(self.base())
+        stage = self.stage(base, look)
+        return self.stage(self.base()) if self._left_out(stage) else stage
+
+    def _left_out(self, stage: Stage) -> bool:
+        """Whether there were windows to leave out whose start, as a stage tells, decides."""
+        before, self.data = self.data, without_starts_told_wild(stage, self.data)
+        if self.data is not before:
+            self._largest.clear()
+        return self.data is not before
 
     def base(self, effects: Sequence[Candidate] = (), start: Array | None = None) -> Base:
         """The hypothesis of some effects, fitted with all its differences."""
@@ -184,20 +176,31 @@ class Search:
         self._tolerance = tolerance_of(best)
         return self.base(effects, usual(best.fit.u)) if np.any(self._tolerance > 1) else base
 
-    def stage(self, base: Base) -> Stage:
-        """Screen all candidates, and fit the best."""
+    def _look(self, base: Base) -> Stage:
+        """A stage of those candidates alone that come nearest to the data at some size."""
         screened = self._screened(base)
-        spoken_for = self._spoken_for(base)
-        wanted = [*spoken_for, *self._large(base, screened)]
+        large = self._large(base, screened)
+        refits = self._refits(base, [s for s in screened if s.candidate in large])
+        return ranked(base, screened, self.trials(base, refits))
+
+    def stage(self, base: Base, look: Stage | None = None) -> Stage:
+        """Screen all candidates, and fit the best, but those that a look from the same base has fitted."""
+        screened = self._screened(base) if look is None else list(look.screened)
+        done = {} if look is None else look.trials
+        wanted = [*self._spoken_for(base), *self._large(base, screened)]
         likely = [s for s in screened[:REFITTED_AT_MOST] if s.gain > EVIDENCE_EACH]
         first = max(REFITTED, len(likely))  # of the screen, whose gains fall
         promising = screened[:first] + [s for s in screened[first:] if s.candidate in wanted]
-        far: dict[Candidate, tuple[Array, ...]] = {candidate: (start,) for candidate, start in spoken_for.items()}
+        refits = self._refits(base, [one for one in promising if one.candidate not in done])
+        return ranked(base, screened, self._in_full(base, screened, done | self.trials(base, refits)))
+
+    def _refits(self, base: Base, promising: Sequence[Screened]) -> list[Refit]:
+        """From where candidates are fitted: afar, too, where the base is far from the data or its priors."""
+        far: dict[Candidate, tuple[Array, ...]] = {c: (start,) for c, start in self._spoken_for(base).items()}
         for candidate in (one.candidate for one in promising):
             if base.excess > LARGE or (base.strained and candidate.effect.name in SPEAKS_FOR.values()):
-                far[candidate] = (*far.get(candidate, ()), _afresh(base))
-        trials = self.trials(base, [Refit(one, far.get(one.candidate, ())) for one in promising])
-        return ranked(base, screened, self._in_full(base, screened, trials))
+                far[candidate] = (*far.get(candidate, ()), afresh(base))
+        return [Refit(one, far.get(one.candidate, ())) for one in promising]
 
     def _screened(self, base: Base) -> list[Screened]:
         """All candidates, as they would act on a base."""
@@ -206,13 +209,19 @@ class Search:
     def _polished(self, stage: Stage) -> Stage:
         """A stage from the base fitted from where candidates led its parameters, if it comes out better there.
 
-        Or what a candidate's fit found, and the base's had missed, would count as the candidate's merit.
+        Or what a candidate's fit found, and the base's had missed, would count as the candidate's merit. Candidates are
+        fitted anew from there, unless the base is far from the data: then they are in their contest, see below.
         """
         base = stage.base
         misfit = Misfit(base.hypothesis, self.data.fitted).with_noise(base.noise)
         found = self._fit(misfit, self._led_to(stage), DIFFERENCES[1:])
-        better = found.loss < base.fit.loss - _BETTER
-        return self.stage(self.base(base.hypothesis.candidates, found.u)) if better else stage
+        if found.loss >= base.fit.loss - _BETTER:
+            return stage
+        if base.excess < LARGE:
+            return self.stage(self.base(base.hypothesis.candidates, found.u))
+        test = Misfit(base.hypothesis, self.data.held_out).with_noise(base.held_out_noise)
+        better = replace(base, fit=found, held_out=HeldOut.of(test, found.u, base.tolerance))
+        return ranked(better, stage.screened, stage.trials)
 
     def _led_to(self, stage: Stage) -> Array:
         """The base's coordinates (d,), of those that its candidates' fits led to, that are best without a candidate."""
@@ -249,12 +258,12 @@ class Search:
             count = max(1, round(_SECONDS_OF_LARGE / self.data.seconds))
             rows = np.argsort(-np.sum(base.fit.errors**2, axis=(1, 2)), kind="stable")[:count]
             windows, noise = self.data.fitted.select(rows), base.noise.select(rows)
-            afresh, nearest = _afresh(base), []
+            start, nearest = afresh(base), []
             for done, one in enumerate(screened):
                 self._progress("try sizes of", done, len(screened))
-                nearest.append(nearest_size(one, windows, noise, afresh))
+                nearest.append(nearest_size(one, windows, noise, start))
             order = np.argsort([loss for loss, _ in nearest], kind="stable")[: _TRIED_FINELY * LARGE_REFITTED]
-            fine = [nearest_size(screened[i], windows, noise, afresh, nearest[i][1])[0] for i in order]
+            fine = [nearest_size(screened[i], windows, noise, start, nearest[i][1])[0] for i in order]
             ordered = [screened[order[i]].candidate for i in np.argsort(fine, kind="stable")]
             self._largest[effects] = of_several_effects(ordered)
         return self._largest[effects]
@@ -358,11 +367,6 @@ class Search:
         found = self._fit(misfit, start, DIFFERENCES[1:])
         told = HeldOut.of(test.with_noise(base.held_out_noise), found.u, base.tolerance)
         return Base(hypothesis, found, told, base.noise, base.held_out_noise, base.tolerance)
-
-
-def _afresh(trial: Trial) -> Array:
-    """A trial's coordinates (d,), its plain parameters at their priors' means."""
-    return np.where(np.arange(len(trial.fit.u)) < trial.hypothesis.num_plain, 0.0, trial.fit.u)
 
 
 def _is_there(base: Base, effect: Candidate, spread: Array) -> bool:

@@ -76,7 +76,8 @@ def chosen(null: Base, base: Base, scores: Sequence[Score]) -> Score | None:
     A law of slightly another form than the true one leaves an error that nothing in the library describes, but much of
     it bends a little. So a further effect must make the model right, to what noise is, or explain a share of what the
     ones before it did. Where even the best leaves more than noise, a simpler one that takes, and leaves, nearly as much
-    is as good. Where the best makes the model right, one that does not is not that law in another form.
+    is as good. Where the best makes the model right, one that does not is not that law in another form; and its form
+    takes no more nats from a law than what it leaves.
     """
     earned, right = [score for score in scores if score.earned], EXPLAINED - 1
     if base is not null:
@@ -92,9 +93,11 @@ def chosen(null: Base, base: Base, scores: Sequence[Score]) -> Score | None:
     most = base.excess - SIMPLER_SHARE * (base.excess - best.trial.excess)
     enough = min(most, SIMPLER_LEAVES * best.trial.excess)
 
+    left = 0.5 * best.trial.held_out.errors.size * best.trial.excess
+
     def clearly(score: Score) -> float:
         alone_right = best.trial.excess < right < score.trial.excess
-        return SIMPLER if alone_right else max(SIMPLER, FURTHER * best.held_out)
+        return SIMPLER if alone_right else max(SIMPLER, min(FURTHER * best.held_out, left))
 
     as_good = [
         s for s in earned if best.total - s.total < clearly(s) or enough > s.trial.excess > best.trial.excess > right

@@ -68,6 +68,11 @@ class Trial:
         return float(np.mean(self.held_out.errors**2)) - 1.0
 
 
+def afresh(trial: Trial) -> Array:
+    """A trial's coordinates (d,), its plain parameters at their priors' means."""
+    return np.where(np.arange(len(trial.fit.u)) < trial.hypothesis.num_plain, 0.0, trial.fit.u)
+
+
 def of_median_window(errors: Array) -> float:
     """Mean square of the whitened errors (w, S, c) of the median window: noise alone leaves 1."""
     return float(np.median(np.mean(errors**2, axis=(1, 2))))

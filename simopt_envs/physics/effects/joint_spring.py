@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mujoco
 
-from simopt_envs.physics.effects.effect import Effect, Motion, object_name
+from simopt_envs.physics.effects.effect import Effect, Motion, Values, object_name
 from simopt_envs.physics.effects.joints import (
     add_fixed_tendon,
     dof,
@@ -15,6 +15,8 @@ from simopt_envs.physics.effects.joints import (
     stiffness_unit,
 )
 from simopt_envs.physics.parameters import Parameter, Write
+
+_LEAST_CHANGE = 0.5  # of the force, as a share of the largest, over the motion
 
 
 class JointSpring(Effect):
@@ -51,3 +53,10 @@ class JointSpring(Effect):
         low, high = float(motion.low[i]), float(motion.high[i])
         stiffness = probe_force(model, joint, motion) / (high - low)
         return tuple({"stiffness": stiffness, "reference": rest} for rest in (low, (low + high) / 2, high))
+
+    def is_itself(self, model: mujoco.MjModel, place: str, motion: Motion, values: Values) -> bool:
+        """A spring that rests far from where its joint moves is a constant force, bent a little."""
+        i = dof(model, object_name(place))
+        low, high = float(motion.low[i]), float(motion.high[i])
+        farthest = max(abs(low - values["reference"]), abs(high - values["reference"]))
+        return high - low > _LEAST_CHANGE * farthest

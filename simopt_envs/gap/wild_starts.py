@@ -1,0 +1,70 @@
+"""Windows in which all depends on how exactly they start: they are left out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from simopt_envs.gap.explanation import Stage
+from simopt_envs.gap.fit import Misfit, fit
+from simopt_envs.gap.hypothesis import Hypothesis
+from simopt_envs.gap.refit import ITERATIONS
+from simopt_envs.gap.thresholds import LARGE, OUTLYING, WILD
+from simopt_envs.gap.trial import Data, afresh, of_median_window
+from simopt_envs.measured.recording import Finding
+from simopt_envs.physics.parameters import Array
+
+
+def without_wild_starts(hypothesis: Hypothesis, u: Array, data: Data, scale: Array, beyond: float = 0.0) -> Data:
+    """Without the windows in which the start decides: those where its error, beyond the linear, makes more than noise.
+
+    A finger that just catches or just slips leaves hundreds of times the noise in the right model too, and one such
+    window would bend all plain parameters. Where it is more than half of the windows, all stay.
+
+    Args:
+        hypothesis: by which windows are judged.
+        u: its coordinates, (d,).
+        data: the windows.
+        scale: standard deviation of each channel's noise, (c,).
+        beyond: times what it leaves of the median window, that it must leave of one that is left out, or that the start
+            could make of it.
+    """
+    kept = []
+    for windows in (data.fitted, data.held_out):
+        misfit = Misfit(hypothesis, windows)
+        left = np.mean(misfit.with_noise(misfit.noise_at(u, scale)).errors(u[None])[0] ** 2, axis=(1, 2))
+        bent = misfit.bent_by_starts(u, scale)
+        wild = (bent > WILD) & (np.maximum(left, bent) > beyond * np.median(left))
+        kept.append(windows if np.mean(wild) > 0.5 else windows.select(np.flatnonzero(~wild)))
+    total = len(data.fitted) + len(data.held_out)
+    left_out = total - sum(map(len, kept))
+    if left_out == 0:
+        return data
+    message = f"{left_out} of {total} left out, where all depends on how exactly they start"
+    warning = Finding.warning("windows", "start", message)
+    return replace(data, fitted=kept[0], held_out=kept[1], warnings=(*data.warnings, warning))
+
+
+def without_starts_told_wild(stage: Stage, data: Data) -> Data:
+    """Without those that a candidate tells which explains the median window, where the base is far from that.
+
+    What the candidate leaves of the others then counts little, but a fit to all has been bent by it, so it is fitted
+    anew, from where that bent nothing, until it tells of no more. An effect that acts in few windows alone leaves the
+    base near to the median one, and so leaves all windows where they are; so does a candidate that would leave out
+    more than half of them.
+    """
+    base = stage.base
+    nearest = min((score.trial for score in stage.scores), key=lambda trial: of_median_window(trial.fit.errors))
+    if of_median_window(base.fit.errors) < LARGE * max(of_median_window(nearest.fit.errors), 1.0):
+        return data
+    hypothesis, u, left = nearest.hypothesis, nearest.fit.u, data
+    while (fewer := without_wild_starts(hypothesis, u, left, base.sensor_noise, OUTLYING)) is not left:
+        left = fewer
+        pairs = (data.fitted, left.fitted), (data.held_out, left.held_out)
+        if any(2 * len(few) < len(windows) for windows, few in pairs):
+            return data
+        misfit = Misfit(hypothesis, left.fitted)
+        misfit = misfit.with_noise(misfit.noise_at(u, base.sensor_noise))
+        u = fit(misfit, afresh(nearest), ITERATIONS).u
+    return left
