@@ -88,8 +88,9 @@ def test_errors_with_their_noise_floor(tmp_path, values):
 
 
 def test_candidates_and_curve(tmp_path):
-    figure = candidates_figure(["one", "two"], [500.0, -3.0], [80.0, -50.0], 5.0, 20.0)
+    figure = candidates_figure(["one", "two"], [500.0, -3.0], [80.0, -50.0], [1.02, 38.1], 5.0, 20.0)
     assert [bar.get_width() for bar in figure.axes[0].patches] == [500.0, -3.0, 80.0, -50.0]
+    assert [label.get_text() for label in figure.axes[0].child_axes[0].get_yticklabels()] == ["1.02", "38.10"]
     assert save_figure(figure, tmp_path / "candidates.png").exists()
     x = np.linspace(-1, 1, 30)
     curve = Curve("force on elbow", "N m", "velocity of elbow", "rad/s", 0.9, x, x**3, np.tile(x**3, (4, 1)))

@@ -159,14 +159,22 @@ def error_figure(values: Sequence[float], intervals: Sequence[tuple[float, float
 
 @styled
 def candidates_figure(
-    names: Sequence[str], fitted: Sequence[float], held_out: Sequence[float], each: float, in_all: float
+    names: Sequence[str],
+    fitted: Sequence[float],
+    held_out: Sequence[float],
+    leaves: Sequence[float],
+    each: float,
+    in_all: float,
 ) -> Figure:
     """What each candidate gains, in nats, best first, against what it must gain to be called missing.
+
+    Gains span decades; what candidates of much gain leave tells them apart.
 
     Args:
         names: of the candidates.
         fitted: gains on the fitted windows, less the price of the parameters.
         held_out: gains on windows that no fit saw.
+        leaves: mean square of the errors there, noise leaves 1.
         each: threshold of either.
         in_all: threshold of their sum.
     """
@@ -186,6 +194,9 @@ def candidates_figure(
     axis.invert_yaxis()
     axis.grid(visible=False, axis="y")
     axis.set_xlabel("gain [nats]")
+    right = axis.secondary_yaxis("right")
+    right.set_yticks(at, [f"{left:,.2f}" for left in leaves])
+    right.set_ylabel("leaves (noise: 1)")
     figure.legend(loc="outside upper right", ncols=3)
     return figure
 

@@ -175,16 +175,17 @@ def candidates(gap: Gap, plots: _Plots) -> Iterator[Section]:
     scores = gap.explanation.stages[0].scores
     names = [str(score.candidate) for score in scores]
     fitted, held_out = ([getattr(score, of) for score in scores] for of in ("fitted", "held_out"))
+    leaves = [1 + score.trial.excess for score in scores]
     yield plots.section(
         "Candidates",
         "candidates",
-        candidates_figure(names, fitted, held_out, thresholds.EVIDENCE_EACH, thresholds.EVIDENCE),
+        candidates_figure(names, fitted, held_out, leaves, thresholds.EVIDENCE_EACH, thresholds.EVIDENCE),
         "The best of the whole library, each alone fitted together with all plain parameters: what it gains over the "
         "refitted model, less the price of its parameters on the fitted recordings.",
     )
     cells = [
-        (name, f"{f:,.0f}", f"{h:,.0f}", f"{1 + score.trial.excess:.3g}", "yes" if score.earned else "no")
-        for name, f, h, score in zip(names, fitted, held_out, scores, strict=True)
+        (name, f"{f:,.0f}", f"{h:,.0f}", f"{left:.3g}", "yes" if score.earned else "no")
+        for name, f, h, left, score in zip(names, fitted, held_out, leaves, scores, strict=True)
     ]
     columns = ("candidate", "gain, fitted", "gain, held out", "mean square left, noise = 1", "enough to be named")
     yield table("", columns, cells, numbers=(1, 2, 3, 4))
