@@ -248,8 +248,7 @@ def test_candidates_are_fitted_the_same_bit_by_bit(recordings):
         found.append(gap)
     local, remote = found
     assert told[0] == told[1]
-    assert ("refit", 0, 6) in told[0]
-    assert ("refit", 6, 6) in told[0]
+    assert {("refit", done, 3) for done in range(4)} <= {*told[0]}  # the three that come nearest at some size
     assert local.effects[0].candidate.place == "joint:elbow"
     for one, other in zip(local.explanation.stages, remote.explanation.stages, strict=True):
         assert [str(score.candidate) for score in one.scores] == [str(score.candidate) for score in other.scores]
@@ -281,7 +280,7 @@ def test_a_candidate_whose_fit_fails_is_named_and_the_others_need_not_be_fitted_
         return find_gap(mujoco.MjSpec.from_string(MODEL), recordings, effects=FEW, directory=found_in)
 
     monkeypatch.setattr(refit, "fit", fit)
-    with pytest.raises(FailedTasksError, match=f"1 of 6 .* {broken}: LinAlgError: singular"):
+    with pytest.raises(FailedTasksError, match=f"1 of 3 .* {broken}: LinAlgError: singular"):
         find(tmp_path)
     finished = len(fitted) - 1
     assert finished > 6
