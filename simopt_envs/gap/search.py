@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -181,7 +181,7 @@ class Search:
         screened = self._screened(base)
         large = self._large(base, screened)
         refits = self._refits(base, [s for s in screened if s.candidate in large])
-        return ranked(base, screened, self.trials(base, refits))
+        return ranked(base, screened, self._in_full(base, screened, self.trials(base, refits)))
 
     def stage(self, base: Base, look: Stage | None = None) -> Stage:
         """Screen all candidates, and fit the best, but those that a look from the same base has fitted."""
@@ -192,7 +192,7 @@ class Search:
         first = max(REFITTED, len(likely))  # of the screen, whose gains fall
         promising = screened[:first] + [s for s in screened[first:] if s.candidate in wanted]
         refits = self._refits(base, [one for one in promising if one.candidate not in done])
-        return ranked(base, screened, self._in_full(base, screened, done | self.trials(base, refits)))
+        return ranked(base, screened, self._in_full(base, screened, done | self.trials(base, refits), done))
 
     def _refits(self, base: Base, promising: Sequence[Screened]) -> list[Refit]:
         """From where candidates are fitted: afar, too, where the base is far from the data or its priors."""
@@ -269,16 +269,21 @@ class Search:
         return self._largest[effects]
 
     def _in_full(
-        self, base: Base, screened: Sequence[Screened], trials: dict[Candidate, Trial]
+        self,
+        base: Base,
+        screened: Sequence[Screened],
+        trials: dict[Candidate, Trial],
+        done: Collection[Candidate] = (),
     ) -> dict[Candidate, Trial]:
         """Trials with those fitted further that earn the most, or would by the screen, where that is enough.
 
-        With the base's derivatives a fit may end halfway, and so hide what an effect earns.
+        With the base's derivatives a fit may end halfway, and so hide what an effect earns. Those that are done have
+        been in their turn.
         """
         first = [s for s in screened if s.candidate in trials][:1]
         best = {s.candidate for s in ranked(base, screened, trials).scores[:_FITTED_IN_FULL] if s.total > EVIDENCE}
         best.update(s.candidate for s in first if s.gain > EVIDENCE)
-        refits = [Refit(s, near=trials[s.candidate].fit.u) for s in screened if s.candidate in best]
+        refits = [Refit(s, near=trials[s.candidate].fit.u) for s in screened if s.candidate in best.difference(done)]
         return trials | self.trials(base, refits)
 
     def trials(self, base: Base, refits: Sequence[Refit]) -> dict[Candidate, Trial]:
