@@ -20,7 +20,7 @@ class Stage:
 
     Attributes:
         base: what there was.
-        screened: every candidate, largest expected gain first.
+        screened: every candidate, most promising first.
         scores: those that were fitted, best first.
     """
 

@@ -40,7 +40,9 @@ class Screened:
 def screen(
     base: Base, candidates: Sequence[Candidate], windows: Windows, progress: Callable[[int, int], None]
 ) -> list[Screened]:
-    """The candidates that a base lacks, largest expected gain first.
+    """The candidates that a base lacks, largest expected gain less the price of their parameters (BIC) first.
+
+    By the gain alone, those that have a shape to choose would crowd out others that need none.
 
     Args:
         base: what they are added to.
@@ -49,11 +51,12 @@ def screen(
         progress: is told how many of how many are done.
     """
     lacking = [c for c in candidates if c not in base.hypothesis.candidates]
+    price = 0.5 * np.log(base.fit.errors.size)
     found = []
     for done, candidate in enumerate(lacking):
         progress(done, len(lacking))
         found.append(_screen_one(base, candidate, windows))
-    return sorted(found, key=lambda s: -s.gain)
+    return sorted(found, key=lambda s: price * len(s.hypothesis.columns[s.candidate]) - s.gain)
 
 
 def _screen_one(base: Base, candidate: Candidate, windows: Windows) -> Screened:

@@ -188,9 +188,8 @@ class Search:
         screened = self._screened(base) if look is None else list(look.screened)
         done = {} if look is None else look.trials
         wanted = [*self._spoken_for(base), *self._large(base, screened)]
-        likely = [s for s in screened[:REFITTED_AT_MOST] if s.gain > EVIDENCE_EACH]
-        first = max(REFITTED, len(likely))  # of the screen, whose gains fall
-        promising = screened[:first] + [s for s in screened[first:] if s.candidate in wanted]
+        likely = [s.candidate for s in screened[:REFITTED_AT_MOST] if s.gain > EVIDENCE_EACH]
+        promising = screened[:REFITTED] + [s for s in screened[REFITTED:] if s.candidate in (*likely, *wanted)]
         refits = self._refits(base, [one for one in promising if one.candidate not in done])
         return ranked(base, screened, self._in_full(base, screened, done | self.trials(base, refits), done))
 

@@ -12,6 +12,7 @@ from simopt_envs.physics.effects.joints import add_link_joint, dof, outermost_jo
 from simopt_envs.physics.parameters import Array, Parameter, Write
 
 _REACH = 1e-5  # rad or m: how far before the end of its range a stop acts
+_HELD = 0.99  # of a load, by a stop; nearer to 1 it gives less, but chatters
 
 
 class Backlash(Effect):
@@ -38,7 +39,7 @@ class Backlash(Effect):
         link.range = [-half, half]
         link.margin = _REACH
         link.solref_limit = [2 * spec.option.timestep, 1.0]  # as fast as is stable, without a bounce
-        link.solimp_limit = [0.9999, 0.9999, 0.001, 0.5, 2.0]  # and it does not give under load
+        link.solimp_limit = [_HELD, _HELD, 0.001, 0.5, 2.0]
 
     def parameters(self, model: mujoco.MjModel, place: str) -> tuple[Parameter, ...]:
         """See :meth:`Effect.parameters`."""
