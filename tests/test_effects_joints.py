@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 import mujoco
 import numpy as np
 import pytest
+from effect_arm import ARM, STEPS, TIMESTEP, structure, with_effect
 
 from simopt_envs.physics import ModelWriter, ParameterSpace
 from simopt_envs.physics.effects import EFFECTS, Motion
@@ -15,39 +16,6 @@ from simopt_envs.physics.spec_writer import write_spec
 
 Batch = pytest.importorskip("mujoco.batch", reason="effects need MuJoCo >= 3.17").Batch
 
-# The classes' defaults are a trap: nothing that an effect adds may inherit them.
-ARM = """
-<mujoco>
-  <compiler angle="degree"/>
-  <option timestep="0.002" integrator="implicitfast"/>
-  <default>
-    <joint damping="0.1" armature="0.02"/>
-    <tendon damping="3" frictionloss="2" limited="true" range="-0.01 0.01"/>
-    <general gear="2" forcerange="-30 30"/>
-  </default>
-  <worldbody>
-    <body name="upper">
-      <joint name="shoulder" type="hinge" axis="0 1 0"/>
-      <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.02"/>
-      <body name="fore" pos="0.3 0 0">
-        <joint name="elbow" type="hinge" axis="0 1 0" ref="10" springref="20"/>
-        <geom type="capsule" fromto="0 0 0 0.25 0 0" size="0.02"/>
-        <site name="tip" pos="0.25 0 0"/>
-      </body>
-    </body>
-    <body name="carriage" pos="0 1 0">
-      <joint name="drive" type="slide" axis="1 0 0" damping="5"/>
-      <geom type="box" size="0.1 0.1 0.1" mass="2"/>
-    </body>
-  </worldbody>
-  <actuator>
-    <position joint="shoulder" kp="60" kv="4"/>
-    <position joint="elbow" kp="40" kv="2"/>
-    <motor joint="drive"/>
-  </actuator>
-</mujoco>
-"""
-STEPS, TIMESTEP = 1000, 0.002
 MOTION = Motion(*(np.array(row) for row in ([-0.8] * 3, [0.8] * 3, [1.5] * 3, [4.0] * 3, [0.5] * 3)))
 
 # place, values, and whether recordings of the neutral structure are the plain model's to this [rad, m]
@@ -64,21 +32,6 @@ CASES: dict[str, tuple[str, dict[str, float], float]] = {
     "quadratic_drag": ("joint:drive", {"drag": 8.0}, 1e-12),
     "stribeck_friction": ("joint:drive", {"frictionloss": 2.0, "breakaway": 4.0, "velocity": 0.2}, 1e-9),
 }
-
-
-def structure(name: str, place: str, arm: str = ARM) -> tuple[mujoco.MjModel, ParameterSpace]:
-    """The arm with an effect's structure, and its parameters."""
-    spec = mujoco.MjSpec.from_string(arm)
-    EFFECTS[name].add(spec, place)
-    model = spec.compile()
-    return model, ParameterSpace(EFFECTS[name].parameters(model, place))
-
-
-def with_effect(name: str, place: str, values: Mapping[str, float] | None = None, arm: str = ARM) -> mujoco.MjModel:
-    """The arm with an effect at some values, its neutral ones by default."""
-    model, space = structure(name, place, arm)
-    ModelWriter(model, space).write_model(space.values(dict(values or {})), model, mujoco.MjData(model))
-    return model
 
 
 def commands() -> np.ndarray:
@@ -391,68 +344,3 @@ def test_a_drive_that_brakes_its_joint_still_counts_as_its_drive() -> None:
 
 
 # A joint behind the motor's: the motor is what is read, the link is what moves.
-
-# The drive with a rotor of 0.5 kg and a link of 2 kg, free to fly.
-FREE_DRIVE = ARM.replace('axis="1 0 0" damping="5"', 'axis="1 0 0" damping="0" armature="0.5"')
-
-
-def test_elasticity_gives_by_the_load_over_the_stiffness() -> None:
-    model = with_effect("joint_elasticity", "joint:elbow", {"stiffness": 60.0})
-    data = mujoco.MjData(model)
-    elbow, link = (model.joint(name).qposadr[0] for name in ("elbow", "elbow.link"))
-    for _ in range(4 * STEPS):
-        mujoco.mj_step(model, data)
-    weight = -data.qfrc_bias[model.joint("elbow").dofadr[0]]
-    assert abs(weight) > 0.3
-    assert data.qpos[link] == pytest.approx(weight / 60, rel=1e-3)
-    assert abs(data.qpos[link]) > 5e-3
-    expected = -0.3 * np.sin(data.qpos[0]) - 0.25 * np.sin(
-        data.qpos[0] + data.qpos[elbow] + data.qpos[link] - np.radians(10)
-    )
-    assert data.site("tip").xpos[2] == pytest.approx(expected, abs=1e-9)
-
-
-@pytest.mark.parametrize("stiffness", [1e2, 1e4])
-def test_elastic_link_swings_as_two_masses_do(stiffness: float) -> None:
-    model = with_effect("joint_elasticity", "joint:drive", {"stiffness": stiffness}, FREE_DRIVE)
-    model.opt.timestep = 1e-4
-    model.dof_damping[model.joint("drive.link").dofadr[0]] *= 0.05  # as fits the timestep
-    data = mujoco.MjData(model)
-    dof, adr = model.joint("drive.link").dofadr[0], model.joint("drive.link").qposadr[0]
-    data.qpos[adr] = 1e-3
-    stretch = []
-    for _ in range(8000):
-        mujoco.mj_step(model, data)
-        stretch.append(data.qpos[adr])
-    crossings = np.flatnonzero(np.diff(np.sign(stretch)))
-    half_period = np.diff(crossings).mean() * 1e-4
-    assert dof == model.nv - 1
-    assert half_period == pytest.approx(np.pi / np.sqrt(stiffness * (1 / 0.5 + 1 / 2.0)), rel=5e-3)
-
-
-def test_backlash_link_rests_on_a_stop_and_is_loose_between() -> None:
-    play = 0.02
-    model = with_effect("backlash", "joint:drive", {"play": play}, FREE_DRIVE)
-    data = mujoco.MjData(model)
-    motor, link = (model.joint(name).id for name in ("drive", "drive.play"))
-    positions = []
-    for i in range(STEPS):
-        data.ctrl[2] = 3.0 * np.sign(np.sin(6 * i * TIMESTEP))
-        mujoco.mj_step(model, data)
-        positions.append(data.qpos[[model.jnt_qposadr[motor], model.jnt_qposadr[link]]].copy())
-    behind = np.array(positions)[:, 1]
-    assert np.abs(behind).max() == pytest.approx(play / 2, abs=1e-3)
-    assert behind.max() > 0.009
-    assert behind.min() < -0.009
-    data = mujoco.MjData(model)
-    data.qvel[model.jnt_dofadr[link]] = 0.01  # in the gap, the motor does not feel the link
-    mujoco.mj_step(model, data, 100)
-    assert data.qvel[model.jnt_dofadr[motor]] == pytest.approx(0.0, abs=1e-6)
-    assert data.qpos[model.jnt_qposadr[link]] == pytest.approx(0.002, rel=1e-3)
-
-
-def test_elasticity_and_backlash_can_be_in_series() -> None:
-    spec = mujoco.MjSpec.from_string(ARM)
-    for name in ("joint_elasticity", "backlash"):
-        EFFECTS[name].add(spec, "joint:elbow")
-    assert spec.compile().nv == 5

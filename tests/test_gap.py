@@ -53,6 +53,17 @@ def test_hidden_friction_is_named_at_its_joint_with_its_size(friction_gap):
     assert errors.after < 1.1 * errors.noise_floor < errors.refit < errors.before
 
 
+def test_candidates_are_screened_by_their_gain_less_the_price_of_their_parameters():
+    recordings = record(lambda q, v: np.zeros(2), np.random.default_rng(6), count=2, seconds=1.0)
+    effects = [EFFECTS[name] for name in ("coulomb_friction", "viscous_friction", "cogging", "actuator_bias")]
+    stage = find_gap(spec(), recordings, effects=effects).explanation.stages[0]
+    price = 0.5 * np.log(stage.base.fit.errors.size)
+    gains = np.array([one.gain for one in stage.screened])
+    parameters = np.array([len(one.hypothesis.columns[one.candidate]) for one in stage.screened])
+    assert np.all(np.diff(gains - price * parameters) <= 0)
+    assert np.any(np.diff(gains) > 0)  # by the gain alone they would stand otherwise
+
+
 def test_a_right_model_with_wrong_plain_parameters_lacks_nothing():
     gap = find_gap(spec(), record(lambda q, v: np.zeros(2), np.random.default_rng(2)), effects=FEW)
     assert gap.verdict == "none"

@@ -12,7 +12,7 @@ from simopt_envs.physics.effects.joints import add_link_joint, dof, outermost_jo
 from simopt_envs.physics.parameters import Array, Parameter, Write
 
 _REACH = 1e-5  # rad or m: how far before the end of its range a stop acts
-_HELD = 0.99  # of a load, by a stop; nearer to 1 it gives less, but chatters
+_HELD = 0.95  # impedance of a stop: nearer to 1 it gives less under load, but chatters
 
 
 class Backlash(Effect):

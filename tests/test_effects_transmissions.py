@@ -1,0 +1,91 @@
+"""Effects between a joint's motor and its link: springs and play."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+from effect_arm import ARM, STEPS, TIMESTEP, with_effect
+
+from simopt_envs.physics.effects import EFFECTS
+
+pytest.importorskip("mujoco.batch", reason="effects need MuJoCo >= 3.17")
+
+# The drive with a rotor of 0.5 kg and a link of 2 kg, free to fly.
+FREE_DRIVE = ARM.replace('axis="1 0 0" damping="5"', 'axis="1 0 0" damping="0" armature="0.5"')
+
+
+def test_elasticity_gives_by_the_load_over_the_stiffness() -> None:
+    model = with_effect("joint_elasticity", "joint:elbow", {"stiffness": 60.0})
+    data = mujoco.MjData(model)
+    elbow, link = (model.joint(name).qposadr[0] for name in ("elbow", "elbow.link"))
+    for _ in range(4 * STEPS):
+        mujoco.mj_step(model, data)
+    weight = -data.qfrc_bias[model.joint("elbow").dofadr[0]]
+    assert abs(weight) > 0.3
+    assert data.qpos[link] == pytest.approx(weight / 60, rel=1e-3)
+    assert abs(data.qpos[link]) > 5e-3
+    expected = -0.3 * np.sin(data.qpos[0]) - 0.25 * np.sin(
+        data.qpos[0] + data.qpos[elbow] + data.qpos[link] - np.radians(10)
+    )
+    assert data.site("tip").xpos[2] == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize("stiffness", [1e2, 1e4])
+def test_elastic_link_swings_as_two_masses_do(stiffness: float) -> None:
+    model = with_effect("joint_elasticity", "joint:drive", {"stiffness": stiffness}, FREE_DRIVE)
+    model.opt.timestep = 1e-4
+    model.dof_damping[model.joint("drive.link").dofadr[0]] *= 0.05  # as fits the timestep
+    data = mujoco.MjData(model)
+    dof, adr = model.joint("drive.link").dofadr[0], model.joint("drive.link").qposadr[0]
+    data.qpos[adr] = 1e-3
+    stretch = []
+    for _ in range(8000):
+        mujoco.mj_step(model, data)
+        stretch.append(data.qpos[adr])
+    crossings = np.flatnonzero(np.diff(np.sign(stretch)))
+    half_period = np.diff(crossings).mean() * 1e-4
+    assert dof == model.nv - 1
+    assert half_period == pytest.approx(np.pi / np.sqrt(stiffness * (1 / 0.5 + 1 / 2.0)), rel=5e-3)
+
+
+def test_backlash_link_rests_on_a_stop_and_is_loose_between() -> None:
+    play = 0.02
+    model = with_effect("backlash", "joint:drive", {"play": play}, FREE_DRIVE)
+    data = mujoco.MjData(model)
+    motor, link = (model.joint(name).id for name in ("drive", "drive.play"))
+    positions = []
+    for i in range(STEPS):
+        data.ctrl[2] = 3.0 * np.sign(np.sin(6 * i * TIMESTEP))
+        mujoco.mj_step(model, data)
+        positions.append(data.qpos[[model.jnt_qposadr[motor], model.jnt_qposadr[link]]].copy())
+    behind = np.array(positions)[:, 1]
+    assert np.abs(behind).max() == pytest.approx(play / 2, abs=1e-3)
+    assert behind.max() > 0.009
+    assert behind.min() < -0.009
+    data = mujoco.MjData(model)
+    data.qvel[model.jnt_dofadr[link]] = 0.01  # in the gap, the motor does not feel the link
+    mujoco.mj_step(model, data, 100)
+    assert data.qvel[model.jnt_dofadr[motor]] == pytest.approx(0.0, abs=1e-6)
+    assert data.qpos[model.jnt_qposadr[link]] == pytest.approx(0.002, rel=1e-3)
+
+
+def test_backlash_link_lies_still_on_a_stop() -> None:
+    model = with_effect("backlash", "joint:elbow", {"play": 0.02})
+    data = mujoco.MjData(model)
+    link = model.joint("elbow.play")
+    turns, last = 0, 0.0
+    for i in range(2 * STEPS):
+        data.ctrl[:2] = np.array([0.6, 0.5]) * np.sin(np.array([3.0, 5.0]) * i * TIMESTEP)
+        mujoco.mj_step(model, data)
+        speed = data.qvel[link.dofadr[0]]
+        turns += int(abs(data.qpos[link.qposadr[0]]) > 0.0099 and speed * last < 0)
+        last = speed
+    assert turns < 60  # stops of impedance 0.9999 make it turn round 190 times
+
+
+def test_elasticity_and_backlash_can_be_in_series() -> None:
+    spec = mujoco.MjSpec.from_string(ARM)
+    for name in ("joint_elasticity", "backlash"):
+        EFFECTS[name].add(spec, "joint:elbow")
+    assert spec.compile().nv == 5
