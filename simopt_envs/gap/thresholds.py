@@ -56,7 +56,7 @@ REFITTED = 6
 """Candidates of the screen that are fitted in any case."""
 
 REFITTED_AT_MOST = 10
-"""Candidates that are fitted where the screen has all of them gain ``EVIDENCE_EACH``."""
+"""First candidates of the screen, of which those that gain ``EVIDENCE_EACH`` by it are fitted."""
 
 LARGE = 10.0
 """Mean square of the whitened held-out errors, above noise, from which effects are tried at several sizes too."""
