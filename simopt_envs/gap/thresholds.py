@@ -14,7 +14,8 @@ set on one case of these). Since then, too, ``LEAST_SHARE`` is not asked of effe
 (one case), and the share ``FURTHER`` of what the best gains excuses none that leaves more than noise where the best
 does not (seed 1 of the gap demonstration). ``SIMPLER`` is asked of all nats alone, not of those held out too, since
 seeds 11000 had been run; since seeds 12000 had, and after seed 1 of the gap demonstration, no more than what the best
-leaves is excused.
+leaves is excused. Since seeds 13000 had, the candidates that ``REFITTED`` and ``REFITTED_AT_MOST`` count come in
+another order: by gain less price (one case).
 """
 
 EVIDENCE = 20.0
