@@ -14,6 +14,7 @@ from simopt_envs.gap.hypothesis import Candidate, Hypothesis
 from simopt_envs.gap.motion import motion_of
 from simopt_envs.gap.plain import plain_parameters
 from simopt_envs.gap.recordings import read_windows
+from simopt_envs.gap.refit import Refit, grown
 from simopt_envs.gap.search import Search, _is_there
 from simopt_envs.gap.thresholds import LARGE
 from simopt_envs.physics.effects import EFFECTS
@@ -25,6 +26,7 @@ DRY = Candidate(EFFECTS["coulomb_friction"], "joint:elbow")
 COGGING = Candidate(EFFECTS["cogging"], "joint:elbow")
 PUSH = Candidate(EFFECTS["actuator_bias"], "actuator:shoulder")
 LIMIT = Candidate(EFFECTS["actuator_saturation"], "actuator:elbow")
+PEAKED = Candidate(EFFECTS["stribeck_friction"], "joint:elbow")
 ONE_SIDED = Candidate(EFFECTS["asymmetric_friction"], "joint:elbow")
 
 
@@ -41,6 +43,29 @@ def test_a_fit_does_not_end_in_the_period_that_its_best_start_is_near():
     (score,) = search.stage(search.base((DRY,))).scores
     hypothesis, u = score.trial.hypothesis, score.trial.fit.u
     assert hypothesis.values(COGGING, hypothesis.xi(u[None])[0])["periods"] == pytest.approx(21.0, rel=0.02)
+
+
+def test_a_fit_goes_on_from_elsewhere_only_if_that_ends_better():
+    """Of cogging with 21 periods per radian, from near 30."""
+    hidden = lambda q, v: np.array([0.0, -0.5 * np.tanh(v[1] / 0.01) - 0.1 * np.sin(21 * q[1] + 1.0)])  # noqa: E731
+    search = _search(hidden, (DRY, COGGING))
+    base = search.base((DRY,))
+    (screened,) = search._screened(base)
+    hypothesis = screened.hypothesis
+
+    def with_periods(periods: float) -> np.ndarray:
+        values = {"amplitude": 0.1, "periods": periods, "phase": 1.0}
+        xi = hypothesis.space.values({COGGING.full_name(name): value for name, value in values.items()})
+        return np.concatenate([base.fit.u, hypothesis.coordinates(xi)[len(base.fit.u) :]])
+
+    def periods_from(*others: np.ndarray) -> float:
+        refit = Refit(screened, near=with_periods(30.0), others=others)
+        (trial,) = search.trials(base, [refit]).values()
+        return hypothesis.values(COGGING, hypothesis.xi(trial.fit.u[None])[0])["periods"]
+
+    assert periods_from(with_periods(21.0)) == pytest.approx(21.0, rel=0.02)
+    assert periods_from() == pytest.approx(29.3, rel=0.01)
+    assert periods_from(with_periods(40.0)) == pytest.approx(29.3, rel=0.01)
 
 
 @pytest.mark.parametrize(("difference", "right"), [(0.5, ONE_SIDED), (0.0, DRY)])
@@ -83,3 +108,27 @@ def test_a_limit_is_there_where_it_acts(limit):
     start[: hypothesis.num_plain] = 0.0
     base = search.base((LIMIT,), start)
     assert _is_there(base, LIMIT, base.spread(search.data)) == (limit < 3)
+
+
+def test_a_peak_of_friction_is_looked_for_from_where_the_fit_of_friction_without_one_ended():
+    search = _search(lambda q, v: np.array([0.0, -0.5 * np.tanh(v[1] / 0.01)]), (DRY, PEAKED, ONE_SIDED))
+    base = search.base()
+    stage = search.stage(base)
+    peaked, one_sided = (next(s for s in stage.screened if s.candidate == c) for c in (PEAKED, ONE_SIDED))
+    starts, of_dry = np.array(grown(peaked, stage.trials)), stage.trials[DRY].fit.u
+    np.testing.assert_array_equal(starts[:, : len(base.fit.u)], np.tile(of_dry[: len(base.fit.u)], (len(starts), 1)))
+    values = [peaked.hypothesis.values(PEAKED, xi) for xi in peaked.hypothesis.xi(starts)]
+    assert [v["frictionloss"] for v in values] == pytest.approx([0.5] * len(values), rel=0.05)
+    assert {round(v["breakaway"] / v["frictionloss"], 6) for v in values} == {1.0, 3.0}
+    assert len({v["velocity"] for v in values}) == 3
+    assert grown(one_sided, stage.trials) == ()
+
+
+def test_from_another_fit_of_the_base_the_best_candidates_go_on_from_where_they_ended():
+    """They are fitted even where the screen, from there, would not have them fitted."""
+    search = _search(lambda q, v: np.array([-3.0 * q[0], -0.5 * np.tanh(v[1] / 0.01)]), (SPRING, DRY))
+    base = search.base()
+    stage = search.stage(base)
+    done = {DRY: stage.trials[DRY]}
+    assert set(search._in_full(base, stage.screened, done, done)) == {DRY}
+    assert set(search._in_full(base, stage.screened, done, done, stage.trials)) == {DRY, SPRING}

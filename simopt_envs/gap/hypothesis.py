@@ -125,6 +125,21 @@ class Hypothesis:
         prefix = candidate.full_name("")
         return {self.space.names[i].removeprefix(prefix): float(xi[i]) for i in self.columns[candidate]}
 
+    def grown(self, smaller: Hypothesis, u: Array) -> Array:
+        """Coordinates (k, d) to go on from where a fit of another hypothesis ended, u.
+
+        Args:
+            smaller: has, for this one's last candidate, the one that that extends.
+            u: its coordinates.
+        """
+        candidate, extended = self.candidates[-1], smaller.candidates[-1]
+        found = smaller.values(extended, smaller.xi(u[None])[0])
+        grown = candidate.effect.grown(self.plain.model, candidate.place, self.motion, found)
+        starts = np.array([self.coordinates(self._probe(candidate, values)) for values in grown])
+        shared = self.columns[candidate][0]
+        starts[:, :shared] = u[:shared]
+        return starts
+
     def usual(self, u: Array) -> Array:
         """Coordinates (d,) that mean the same, with each effect's values as people write them."""
         out, xi = u.copy(), self.xi(u[None])[0]

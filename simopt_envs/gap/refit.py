@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from simopt_envs.adaptation.checkpoint import Result
 from simopt_envs.gap.fit import DIFFERENCES, Fit, Misfit, fit
+from simopt_envs.gap.hypothesis import Candidate
 from simopt_envs.gap.large import best_of_each, of_some_size
 from simopt_envs.gap.predictive import HeldOut
 from simopt_envs.gap.screen import Screened
-from simopt_envs.gap.trial import Base
+from simopt_envs.gap.trial import Base, Trial
 from simopt_envs.measured.windows import Windows
 from simopt_envs.physics.parameters import Array
 
@@ -27,16 +29,18 @@ class Refit:
         screened: the candidate.
         far: coordinates of the base (d,) from which the candidate is fitted too, at the size that it then needs.
         near: where an earlier fit ended, (d,), which this one goes on from with all derivatives taken.
+        others: coordinates, (d,), that it may go on from as well, if a coarse fit from there ends better.
     """
 
     screened: Screened
     far: tuple[Array, ...] = ()
     near: Array | None = None
+    others: tuple[Array, ...] = ()
 
     @property
     def starts(self) -> tuple[Array, ...]:
         """All coordinates that it begins with."""
-        return (self.screened.starts, *self.far) if self.near is None else (self.near,)
+        return (self.screened.starts, *self.far) if self.near is None else (self.near, *self.others)
 
     def __repr__(self) -> str:
         return str(self.screened.candidate)
@@ -52,8 +56,8 @@ def fitted(refit: Refit, base: Base, windows: Windows, held_out: Windows, num_th
     """
     screened, hypothesis = refit.screened, refit.screened.hypothesis
     misfit = Misfit(hypothesis, windows, num_threads).with_noise(base.noise)
+    of_base = range(len(base.fit.u))
     if refit.near is None:
-        of_base = range(len(base.fit.u))
         coarse = [_coarsely(misfit, u, base.fit.jacobian) for u in best_of_each(misfit, screened.starts)]
         for afar in refit.far:
             start = np.concatenate([afar, hypothesis.neutral()[len(afar) :]])
@@ -63,7 +67,8 @@ def fitted(refit: Refit, base: Base, windows: Windows, held_out: Windows, num_th
         known = np.ascontiguousarray(best.jacobian[:, of_base])
         found = fit(misfit, best.u, ITERATIONS, known=known, differences=DIFFERENCES[1:])
     else:
-        found = fit(misfit, refit.near, ITERATIONS, differences=DIFFERENCES[1:])
+        others = [_coarsely(misfit, u, misfit.jacobian(u, of_base, DIFFERENCES[0])).u for u in refit.others]
+        found = fit(misfit, misfit.best(np.array([refit.near, *others])), ITERATIONS, differences=DIFFERENCES[1:])
     test = Misfit(hypothesis, held_out, num_threads).with_noise(base.held_out_noise)
     foreseen = base.held_out.jacobian if refit.near is None else None
     told = HeldOut.of(test, found.u, base.tolerance, foreseen)
@@ -73,3 +78,17 @@ def fitted(refit: Refit, base: Base, windows: Windows, held_out: Windows, num_th
 def _coarsely(misfit: Misfit, start: Array, known: Array) -> Fit:
     """A fit from one of several starts, which alone tell little of where they lead."""
     return fit(misfit, start, ITERATIONS, known=known, differences=DIFFERENCES[:1])
+
+
+def extended(candidate: Candidate, trials: Collection[Candidate]) -> Candidate | None:
+    """The one of some trials that a candidate extends, if any."""
+    ones = (c for c in trials if c.effect.name == candidate.effect.extends and c.place == candidate.place)
+    return next(ones, None)
+
+
+def grown(screened: Screened, trials: Mapping[Candidate, Trial]) -> tuple[Array, ...]:
+    """Where a candidate's fit may go on from that of the one that it extends."""
+    smaller = extended(screened.candidate, trials)
+    if smaller is None:
+        return ()
+    return tuple(screened.hypothesis.grown(trials[smaller].hypothesis, trials[smaller].fit.u))

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from simopt_envs.gap.kept import kept_fits, key_of
 from simopt_envs.gap.large import nearest_size, of_several_effects
 from simopt_envs.gap.plain import SPEAKS_FOR, Plain
 from simopt_envs.gap.predictive import HeldOut
-from simopt_envs.gap.refit import ITERATIONS, Refit, fitted
+from simopt_envs.gap.refit import ITERATIONS, Refit, extended, fitted, grown
 from simopt_envs.gap.screen import Screened, screen
 from simopt_envs.gap.selection import Score, chosen, score_of, tolerance_of, worth_of
 from simopt_envs.gap.thresholds import (
@@ -183,15 +184,19 @@ class Search:
         refits = self._refits(base, [s for s in screened if s.candidate in large])
         return ranked(base, screened, self._in_full(base, screened, self.trials(base, refits)))
 
-    def stage(self, base: Base, look: Stage | None = None) -> Stage:
-        """Screen all candidates, and fit the best, but those that a look from the same base has fitted."""
+    def stage(self, base: Base, look: Stage | None = None, before: Stage | None = None) -> Stage:
+        """Screen all candidates, and fit the best, but those that a look from the same base has fitted.
+
+        The best of a stage before, from another fit of the base, are fitted from where they ended there, too.
+        """
         screened = self._screened(base) if look is None else list(look.screened)
         done = {} if look is None else look.trials
         wanted = [*self._spoken_for(base), *self._large(base, screened)]
         likely = [s.candidate for s in screened[:REFITTED_AT_MOST] if s.gain > EVIDENCE_EACH]
         promising = screened[:REFITTED] + [s for s in screened[REFITTED:] if s.candidate in (*likely, *wanted)]
         refits = self._refits(base, [one for one in promising if one.candidate not in done])
-        return ranked(base, screened, self._in_full(base, screened, done | self.trials(base, refits), done))
+        trials = done | self.trials(base, refits)
+        return ranked(base, screened, self._in_full(base, screened, trials, done, _best_of(before)))
 
     def _refits(self, base: Base, promising: Sequence[Screened]) -> list[Refit]:
         """From where candidates are fitted: afar, too, where the base is far from the data or its priors."""
@@ -217,7 +222,7 @@ class Search:
         if found.loss >= base.fit.loss - _BETTER:
             return stage
         if base.excess < LARGE:
-            return self.stage(self.base(base.hypothesis.candidates, found.u))
+            return self.stage(self.base(base.hypothesis.candidates, found.u), before=stage)
         test = Misfit(base.hypothesis, self.data.held_out).with_noise(base.held_out_noise)
         better = replace(base, fit=found, held_out=HeldOut.of(test, found.u, base.tolerance))
         return ranked(better, stage.screened, stage.trials)
@@ -273,16 +278,22 @@ class Search:
         screened: Sequence[Screened],
         trials: dict[Candidate, Trial],
         done: Collection[Candidate] = (),
+        before: Mapping[Candidate, Trial] = MappingProxyType({}),
     ) -> dict[Candidate, Trial]:
         """Trials with those fitted further that earn the most, or would by the screen, where that is enough.
 
         With the base's derivatives a fit may end halfway, and so hide what an effect earns. Those that are done have
-        been in their turn.
+        been in their turn; those that were fitted before, from another fit of the base, may go on from there.
         """
         first = [s for s in screened if s.candidate in trials][:1]
         best = {s.candidate for s in ranked(base, screened, trials).scores[:_FITTED_IN_FULL] if s.total > EVIDENCE}
         best.update(s.candidate for s in first if s.gain > EVIDENCE)
-        refits = [Refit(s, near=trials[s.candidate].fit.u) for s in screened if s.candidate in best.difference(done)]
+        best.update(c for c in trials if (smaller := extended(c, trials)) in best and smaller not in done)
+        refits = []
+        for one in screened:
+            if one.candidate in best.union(before).difference(done):
+                ends = [found[one.candidate].fit.u for found in (trials, before) if one.candidate in found]
+                refits.append(Refit(one, near=ends[0], others=(*ends[1:], *grown(one, trials))))
         return trials | self.trials(base, refits)
 
     def trials(self, base: Base, refits: Sequence[Refit]) -> dict[Candidate, Trial]:
@@ -371,6 +382,11 @@ class Search:
         found = self._fit(misfit, start, DIFFERENCES[1:])
         told = HeldOut.of(test.with_noise(base.held_out_noise), found.u, base.tolerance)
         return Base(hypothesis, found, told, base.noise, base.held_out_noise, base.tolerance)
+
+
+def _best_of(stage: Stage | None) -> dict[Candidate, Trial]:
+    """What the best candidates of a stage, if any, came to."""
+    return {} if stage is None else {score.candidate: score.trial for score in stage.scores[:_FITTED_IN_FULL]}
 
 
 def _is_there(base: Base, effect: Candidate, spread: Array) -> bool:

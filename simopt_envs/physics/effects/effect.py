@@ -44,6 +44,7 @@ class Effect(ABC):
         law: one line, as a person would write it.
         shape: those of its parameters that say what it is like, not how much of it there is.
         levers: those of its shape in whose product with its amount, its first parameter, the law is linear.
+        extends: the effect that it is without some of its amounts, if any; their other parameters have the same names.
         of_reading: whether it is about what recordings show of its place, which must then be among their columns.
     """
 
@@ -51,6 +52,7 @@ class Effect(ABC):
     law: ClassVar[str]
     shape: ClassVar[tuple[str, ...]] = ()
     levers: ClassVar[tuple[str, ...]] = ()
+    extends: ClassVar[str] = ""
     of_reading: ClassVar[bool] = False
 
     @abstractmethod
@@ -81,6 +83,10 @@ class Effect(ABC):
         A probe and a multiple of it, in all but its :attr:`shape`, are told apart by the fit; another shape (width of
         a detent) needs a probe of its own. Every parameter differs from its nominal in at least one probe.
         """
+
+    def grown(self, model: mujoco.MjModel, place: str, motion: Motion, values: Values) -> tuple[dict[str, float], ...]:
+        """Values to go on from where those of the effect that it :attr:`extends` have been fitted."""
+        return ()
 
     def rest(self, place: str, values: Values, loads: Mapping[str, Array]) -> dict[str, Array]:
         """Where the joints that it adds rest, by name, under the loads (w,) [N m, N] that joints carry."""

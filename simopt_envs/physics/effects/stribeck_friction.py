@@ -17,6 +17,7 @@ from simopt_envs.physics.effects.joints import (
 from simopt_envs.physics.parameters import Parameter, Write
 
 _STIFFNESS = 0.05  # of bristles, in units of inertia / timestep^2: MuJoCo integrates them explicitly
+_PEAKS = (1.0, 3.0)  # times the Coulomb friction
 
 
 class StribeckFriction(Effect):
@@ -29,6 +30,7 @@ class StribeckFriction(Effect):
     name = "stribeck_friction"
     law = "f = -(F + B exp(-(v/vs)^2)) sign(v)"
     shape = ("velocity",)
+    extends = "coulomb_friction"
 
     def places(self, model: mujoco.MjModel) -> tuple[str, ...]:
         """See :meth:`Effect.places`."""
@@ -59,6 +61,16 @@ class StribeckFriction(Effect):
         force, speed = probe_force(model, joint, motion), float(motion.speed[dof(model, joint)])
         return tuple(
             {"frictionloss": force, "breakaway": force, "velocity": fraction * speed} for fraction in (0.05, 0.2, 0.6)
+        )
+
+    def grown(self, model: mujoco.MjModel, place: str, motion: Motion, values: Values) -> tuple[dict[str, float], ...]:
+        """See :meth:`Effect.grown`. A fit of a small peak finds a wide one: a high, narrow one is far from there."""
+        friction = values["frictionloss"]
+        velocities = [probe["velocity"] for probe in self.probes(model, place, motion)]
+        return tuple(
+            {"frictionloss": friction, "breakaway": share * friction, "velocity": velocity}
+            for velocity in velocities
+            for share in _PEAKS
         )
 
     def is_itself(self, model: mujoco.MjModel, place: str, motion: Motion, values: Values) -> bool:
