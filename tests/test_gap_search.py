@@ -131,4 +131,4 @@ def test_from_another_fit_of_the_base_the_best_candidates_go_on_from_where_they_
     stage = search.stage(base)
     done = {DRY: stage.trials[DRY]}
     assert set(search._in_full(base, stage.screened, done, done)) == {DRY}
-    assert set(search._in_full(base, stage.screened, done, done, stage.trials)) == {DRY, SPRING}
+    assert set(search._in_full(base, stage.screened, done, done, stage)) == {DRY, SPRING}

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from types import MappingProxyType
 
 import numpy as np
 
@@ -196,7 +195,7 @@ class Search:
         promising = screened[:REFITTED] + [s for s in screened[REFITTED:] if s.candidate in (*likely, *wanted)]
         refits = self._refits(base, [one for one in promising if one.candidate not in done])
         trials = done | self.trials(base, refits)
-        return ranked(base, screened, self._in_full(base, screened, trials, done, _best_of(before)))
+        return ranked(base, screened, self._in_full(base, screened, trials, done, before))
 
     def _refits(self, base: Base, promising: Sequence[Screened]) -> list[Refit]:
         """From where candidates are fitted: afar, too, where the base is far from the data or its priors."""
@@ -278,21 +277,22 @@ class Search:
         screened: Sequence[Screened],
         trials: dict[Candidate, Trial],
         done: Collection[Candidate] = (),
-        before: Mapping[Candidate, Trial] = MappingProxyType({}),
+        before: Stage | None = None,
     ) -> dict[Candidate, Trial]:
         """Trials with those fitted further that earn the most, or would by the screen, where that is enough.
 
         With the base's derivatives a fit may end halfway, and so hide what an effect earns. Those that are done have
-        been in their turn; those that were fitted before, from another fit of the base, may go on from there.
+        been in their turn; the best of a stage before, from another fit of the base, may go on from there.
         """
+        earlier = {} if before is None else {s.candidate: s.trial for s in before.scores[:_FITTED_IN_FULL]}
         first = [s for s in screened if s.candidate in trials][:1]
         best = {s.candidate for s in ranked(base, screened, trials).scores[:_FITTED_IN_FULL] if s.total > EVIDENCE}
         best.update(s.candidate for s in first if s.gain > EVIDENCE)
         best.update(c for c in trials if (smaller := extended(c, trials)) in best and smaller not in done)
         refits = []
         for one in screened:
-            if one.candidate in best.union(before).difference(done):
-                ends = [found[one.candidate].fit.u for found in (trials, before) if one.candidate in found]
+            if one.candidate in best.union(earlier).difference(done):
+                ends = [found[one.candidate].fit.u for found in (trials, earlier) if one.candidate in found]
                 refits.append(Refit(one, near=ends[0], others=(*ends[1:], *grown(one, trials))))
         return trials | self.trials(base, refits)
 
@@ -382,11 +382,6 @@ class Search:
         found = self._fit(misfit, start, DIFFERENCES[1:])
         told = HeldOut.of(test.with_noise(base.held_out_noise), found.u, base.tolerance)
         return Base(hypothesis, found, told, base.noise, base.held_out_noise, base.tolerance)
-
-
-def _best_of(stage: Stage | None) -> dict[Candidate, Trial]:
-    """What the best candidates of a stage, if any, came to."""
-    return {} if stage is None else {score.candidate: score.trial for score in stage.scores[:_FITTED_IN_FULL]}
 
 
 def _is_there(base: Base, effect: Candidate, spread: Array) -> bool:
