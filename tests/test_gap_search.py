@@ -10,12 +10,14 @@ import pytest
 from conftest import needs_effects
 from gap_plant import MODEL, Law, record
 
+from simopt_envs.gap.explanation import ranked
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
 from simopt_envs.gap.motion import motion_of
 from simopt_envs.gap.plain import plain_parameters
 from simopt_envs.gap.recordings import read_windows
 from simopt_envs.gap.refit import Refit, grown
-from simopt_envs.gap.search import Search, _is_there
+from simopt_envs.gap.search import Search
+from simopt_envs.gap.selection import is_there
 from simopt_envs.gap.thresholds import LARGE
 from simopt_envs.physics.effects import EFFECTS
 
@@ -96,7 +98,22 @@ def test_far_from_the_data_what_is_taken_is_held_against_its_rivals_anew(stiffne
 def test_an_effect_is_there_if_its_interval_leaves_out_none_of_it(friction):
     search = _search(lambda q, v: np.array([0.0, -friction * np.tanh(v[1] / 0.01)]), (DRY,))
     base = search.base((DRY,))
-    assert _is_there(base, DRY, base.spread(search.data)) == (friction > 0)
+    assert is_there(base, DRY, base.spread(search.data)) == (friction > 0)
+
+
+@pytest.mark.parametrize(("around_rest", "right"), [(-0.5, DRY), (1.5, PEAKED)])
+def test_an_effect_gives_way_to_the_one_that_it_extends_if_what_it_adds_is_not_there(around_rest, right):
+    """Less friction of the elbow at low speed, or more, and a spring; by its gain, the one extended was no rival."""
+
+    def hidden(q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        friction = (0.5 + around_rest * np.exp(-((v[1] / 0.3) ** 2))) * np.tanh(v[1] / 0.01)
+        return np.array([-3.0 * q[0], -friction])
+
+    search = _search(hidden, (SPRING, DRY, PEAKED))
+    stage = search.stage(search.base())
+    without = ranked(stage.base, stage.screened, {c: trial for c, trial in stage.trials.items() if c != DRY})
+    final, effects = search._revised(search.base((PEAKED, SPRING)), [without])
+    assert {*final.hypothesis.candidates} == {right, SPRING} == {score.candidate for score in effects}
 
 
 @pytest.mark.parametrize("limit", [1.2, 5.0])
@@ -107,7 +124,7 @@ def test_a_limit_is_there_where_it_acts(limit):
     start = hypothesis.coordinates(hypothesis.space.values({LIMIT.full_name("limit"): limit}))
     start[: hypothesis.num_plain] = 0.0
     base = search.base((LIMIT,), start)
-    assert _is_there(base, LIMIT, base.spread(search.data)) == (limit < 3)
+    assert is_there(base, LIMIT, base.spread(search.data)) == (limit < 3)
 
 
 def test_a_peak_of_friction_is_looked_for_from_where_the_fit_of_friction_without_one_ended():

@@ -34,9 +34,10 @@ class Stage:
         return {score.candidate: score.trial for score in self.scores}
 
     def rivals(self, effect: Candidate) -> set[Candidate]:
-        """The other candidates that do nearly as much as the one that was taken, or more."""
+        """The other candidates that do nearly as much as the one that was taken, or more; none if it was not fitted."""
         total = {score.candidate: score.total for score in self.scores}
-        return {candidate for candidate in total if candidate != effect and total[effect] - total[candidate] < EVIDENCE}
+        least = total.get(effect, np.inf) - EVIDENCE
+        return {candidate for candidate in total if candidate != effect and total[candidate] > least}
 
 
 def ranked(base: Base, screened: Sequence[Screened], trials: Mapping[Candidate, Trial]) -> Stage:

@@ -154,6 +154,11 @@ class Hypothesis:
         shape = {candidate.full_name(name) for name in candidate.effect.shape}
         return [i for i in self.columns[candidate] if self.space.names[i] not in shape]
 
+    def added(self, candidate: Candidate, smaller: Candidate) -> list[int]:
+        """The columns of a candidate's parameters that the effect which it extends, at that place, has not."""
+        names = [candidate.full_name(p.name) for p in smaller.effect.parameters(self.plain.model, smaller.place)]
+        return [i for i in self.columns[candidate] if self.space.names[i] not in names]
+
     @property
     def products(self) -> list[tuple[int, int]]:
         """Columns of a shape in whose product with an amount a law is linear, each with that of the amount."""

@@ -22,10 +22,9 @@ from simopt_envs.gap.plain import SPEAKS_FOR, Plain
 from simopt_envs.gap.predictive import HeldOut
 from simopt_envs.gap.refit import ITERATIONS, Refit, extended, fitted, grown
 from simopt_envs.gap.screen import Screened, screen
-from simopt_envs.gap.selection import Score, chosen, score_of, tolerance_of, worth_of
+from simopt_envs.gap.selection import Score, chosen, is_there, score_of, tolerance_of, worth_of
 from simopt_envs.gap.thresholds import (
     BENT,
-    CONFIDENT,
     EVIDENCE,
     EVIDENCE_EACH,
     FAR,
@@ -347,17 +346,20 @@ class Search:
 
         With it comes what each earns, most first. With and without are compared in one noise, that of the model with
         all: what uncertain starts leave depends on the model too. An effect whose interval holds "none of it" goes as
-        well: the evidence for it is of a few stretches, and others speak against it. What was dropped does not come
-        back.
+        well: the evidence for it is of a few stretches, and others speak against it. One of which that holds for all
+        that it adds to the effect that it extends gives way to that. What was dropped does not come back.
         """
         effects, earned = base.hypothesis.candidates, []
         if not effects:
             return base, ()
         spread = base.spread(self.data)
         for effect in effects:
+            smaller = extended(effect, {*self.candidates} - dropped - {*effects})
+            if smaller is not None and not is_there(base, effect, spread, smaller):
+                return self._revised(self._reduced(base, effect, smaller), stages, dropped | {effect})
             without = self._without(base, effect, stages)
             score = score_of(without, effect, base, worth_of(base))
-            if not (score.earned and _is_there(base, effect, spread)):
+            if not (score.earned and is_there(base, effect, spread)):
                 return self._revised(self.base(without.hypothesis.candidates, without.fit.u), stages, dropped)
             earned.append(score)
             rivals = stage_of(stages, effect).rivals(effect) - dropped - {*effects} if len(effects) > 1 else ()
@@ -383,9 +385,8 @@ class Search:
         told = HeldOut.of(test.with_noise(base.held_out_noise), found.u, base.tolerance)
         return Base(hypothesis, found, told, base.noise, base.held_out_noise, base.tolerance)
 
-
-def _is_there(base: Base, effect: Candidate, spread: Array) -> bool:
-    """Whether an effect's interval leaves out that there is none of it; a limit, without an amount, that it is none."""
-    hypothesis = base.hypothesis
-    off = np.abs(base.fit.u - hypothesis.neutral()) > CONFIDENT * spread
-    return bool(np.any(off[hypothesis.amounts(effect) or hypothesis.columns[effect]]))
+    def _reduced(self, base: Base, effect: Candidate, smaller: Candidate) -> Base:
+        """A base with the effect that one of its effects extends instead of that, from what both share."""
+        left = tuple(smaller if e == effect else e for e in base.hypothesis.candidates)
+        shared = np.delete(base.hypothesis.xi(base.fit.u[None])[0], base.hypothesis.added(effect, smaller))
+        return self.base(left, Hypothesis(self.plain, left, self.motion).coordinates(shared))

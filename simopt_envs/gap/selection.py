@@ -12,6 +12,7 @@ from simopt_envs.gap.hypothesis import Candidate
 from simopt_envs.gap.plain import SPEAKS_FOR
 from simopt_envs.gap.thresholds import (
     COARSE,
+    CONFIDENT,
     EVIDENCE,
     EVIDENCE_EACH,
     EXPLAINED,
@@ -143,3 +144,16 @@ def score_of(base: Base, candidate: Candidate, trial: Trial, worth: Array) -> Sc
     before, after = (t.held_out.surprise(t.precision(weight), worth) for t in (base, trial))
     held_out = before - after + of_prior
     return Score(candidate, trial, float(fitted), float(held_out), of_prior)
+
+
+def is_there(base: Base, effect: Candidate, spread: Array, smaller: Candidate | None = None) -> bool:
+    """Whether an effect's interval leaves out that there is none of it; a limit, without an amount, that it is none.
+
+    With a smaller one, which it extends: none of what it adds to that.
+    """
+    hypothesis = base.hypothesis
+    off = np.abs(base.fit.u - hypothesis.neutral()) > CONFIDENT * spread
+    columns = hypothesis.amounts(effect) or hypothesis.columns[effect]
+    if smaller is not None:
+        columns = [i for i in hypothesis.added(effect, smaller) if i in columns]
+    return bool(np.any(off[columns]))
