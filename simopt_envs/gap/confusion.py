@@ -1,4 +1,4 @@
-"""Which effects the data can hardly tell from the one named, and the motion that would."""
+"""Which effects change the data much as the one named does, and the motion that would tell them apart."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Separation:
 
 @dataclass(frozen=True)
 class Partner:
-    """An effect that these data hardly tell from the one named.
+    """An effect that changes these data much as the one named does.
 
     Attributes:
         candidate: it.

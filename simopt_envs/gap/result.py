@@ -49,7 +49,7 @@ class Named:
         candidate: the effect and its place.
         parameters: its numbers by their short names.
         evidence: nats that it earns beside the others, ``"fitted"`` and ``"held_out"``.
-        partners: effects that these data hardly tell from it.
+        partners: effects that change these data much as it does.
     """
 
     candidate: Candidate
