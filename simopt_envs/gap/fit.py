@@ -267,8 +267,9 @@ def fit(
 
     x = chart.straight(np.clip(start, hypothesis.low, hypothesis.high))
     for difference in differences:
-        x = _descended(x, residual, partial(jacobian, difference=difference), chart, iterations)
-    rows = jacobian(x, differences[-1])
+        derivatives = _Derivatives(partial(jacobian, difference=difference))
+        x = _descended(x, residual, derivatives, chart, iterations)
+    rows = derivatives(x)
     for _ in range(_LOOKS if of_effects and differences[-1] == DIFFERENCES[-1] else 0):
         ahead = _ahead(x, rows, of_effects)
         losses = misfit.losses(chart.bent(np.vstack([x, ahead])))
@@ -276,11 +277,23 @@ def fit(
         if losses[best] > losses[0] - _WORTH_GOING:
             break
         x = ahead[best - 1]
-        x = _descended(x, residual, partial(jacobian, difference=differences[-1]), chart, iterations)
-        rows = jacobian(x, differences[-1])
+        x = _descended(x, residual, derivatives, chart, iterations)
+        rows = derivatives(x)
     u = chart.bent(x)
     errors = misfit.errors(u[None])[0]
     return Fit(u, errors, chart.by_u(rows[: errors.size], u), hypothesis.prior_std)
+
+
+class _Derivatives:
+    """Of a residual by x, (m, d), taken once where they are asked for again: at the end of a fit they are there."""
+
+    def __init__(self, take: Callable[[Array], Array]):
+        self._take, self._x, self._rows = take, np.empty(0), np.empty(0)
+
+    def __call__(self, x: Array) -> Array:
+        if not np.array_equal(x, self._x):
+            self._x, self._rows = x.copy(), self._take(x)
+        return self._rows
 
 
 def _descended(

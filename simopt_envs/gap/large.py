@@ -14,6 +14,9 @@ from simopt_envs.gap.thresholds import LARGE_REFITTED
 from simopt_envs.measured.windows import Windows
 from simopt_envs.physics.parameters import Array
 
+SECONDS = 2.0
+"""Of the windows of which a base leaves the most, that sizes are tried on."""
+
 _SIZES = np.outer([-1.0, 1.0], [1.0, 3.0, 10.0, 30.0, 100.0, 300.0]).ravel()  # probes
 _SHAPES = 3  # that a fit starts from, as starts alone tell little
 _FINER = np.geomspace([0.4, 0.9], [2.5, 1.1], 9).T  # of the best so far: where things touch, a fit from afar gets stuck

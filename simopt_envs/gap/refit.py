@@ -6,11 +6,12 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from simopt_envs.adaptation.checkpoint import Result
-from simopt_envs.gap.fit import DIFFERENCES, Fit, Misfit, fit
+from simopt_envs.gap.fit import DIFFERENCES, Misfit, fit
 from simopt_envs.gap.hypothesis import Candidate
-from simopt_envs.gap.large import best_of_each, of_some_size
+from simopt_envs.gap.large import SECONDS, best_of_each, of_some_size
 from simopt_envs.gap.predictive import HeldOut
 from simopt_envs.gap.screen import Screened
 from simopt_envs.gap.trial import Base, Trial
@@ -53,21 +54,32 @@ def fitted(refit: Refit, base: Base, windows: Windows, held_out: Windows, num_th
     candidate is fitted at the size that it would need, too: with what speaks for it taken away, and with all plain
     parameters at their priors' means; derivatives by these are taken once, there. A base that an effect has bent is the
     end of a valley that leads away from the right one. A fit that goes on from another takes them all at each step.
+
+    Starts are told apart by those windows alone of which the base leaves the most, then fitted to all.
     """
     screened, hypothesis = refit.screened, refit.screened.hypothesis
     misfit = Misfit(hypothesis, windows, num_threads).with_noise(base.noise)
-    of_base = range(len(base.fit.u))
+    rows, of_base = base.worst(len(windows) / 2), range(len(base.fit.u))
+
+    def on(some: NDArray[np.intp]) -> Misfit:
+        return Misfit(hypothesis, windows.select(some), num_threads).with_noise(base.noise.select(some))
+
+    half = on(rows)
     if refit.near is None:
-        coarse = [_coarsely(misfit, u, base.fit.jacobian) for u in best_of_each(misfit, screened.starts)]
+        starts = best_of_each(half, screened.starts)
+        known = base.fit.jacobian.reshape(len(windows), -1, len(of_base))[rows].reshape(-1, len(of_base))
+        coarse = [_coarsely(half, u, known) for u in starts]
         for afar in refit.far:
-            start = np.concatenate([afar, hypothesis.neutral()[len(afar) :]])
-            for u in of_some_size(misfit, screened.candidate, start):
-                coarse.append(_coarsely(misfit, u, misfit.jacobian(u, of_base, DIFFERENCES[0])))
-        best = min(coarse, key=lambda f: f.loss)
-        known = np.ascontiguousarray(best.jacobian[:, of_base])
-        found = fit(misfit, best.u, ITERATIONS, known=known, differences=DIFFERENCES[1:])
+            neutral = np.concatenate([afar, hypothesis.neutral()[len(afar) :]])
+            far = of_some_size(on(base.worst(SECONDS / windows.seconds)), screened.candidate, neutral)
+            known = half.jacobian(far[0], of_base, DIFFERENCES[0])
+            coarse += [_coarsely(half, u, known) for u in far]
+        best = int(np.argmin(misfit.losses(np.array(coarse))))
+        near = best < len(starts)
+        known = base.fit.jacobian if near else misfit.jacobian(coarse[best], of_base, DIFFERENCES[0])
+        found = fit(misfit, coarse[best], ITERATIONS, known=known, differences=DIFFERENCES[1:])
     else:
-        others = [_coarsely(misfit, u, misfit.jacobian(u, of_base, DIFFERENCES[0])).u for u in refit.others]
+        others = [_coarsely(half, u, half.jacobian(u, of_base, DIFFERENCES[0])) for u in refit.others]
         found = fit(misfit, misfit.best(np.array([refit.near, *others])), ITERATIONS, differences=DIFFERENCES[1:])
     test = Misfit(hypothesis, held_out, num_threads).with_noise(base.held_out_noise)
     foreseen = base.held_out.jacobian if refit.near is None else None
@@ -75,9 +87,9 @@ def fitted(refit: Refit, base: Base, windows: Windows, held_out: Windows, num_th
     return {**vars(found), "held_out": told.errors, "held_out_jacobian": told.jacobian}
 
 
-def _coarsely(misfit: Misfit, start: Array, known: Array) -> Fit:
-    """A fit from one of several starts, which alone tell little of where they lead."""
-    return fit(misfit, start, ITERATIONS, known=known, differences=DIFFERENCES[:1])
+def _coarsely(misfit: Misfit, start: Array, known: Array) -> Array:
+    """Where a coarse fit leads, (d,), from one of several starts, which alone tell little of that."""
+    return fit(misfit, start, ITERATIONS, known=known, differences=DIFFERENCES[:1]).u
 
 
 def extended(candidate: Candidate, trials: Collection[Candidate]) -> Candidate | None:

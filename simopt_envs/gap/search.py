@@ -17,7 +17,7 @@ from simopt_envs.gap.explanation import Explanation, Stage, ranked, stage_of
 from simopt_envs.gap.fit import DIFFERENCES, Fit, Misfit, fit
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
 from simopt_envs.gap.kept import kept_fits, key_of
-from simopt_envs.gap.large import nearest_size, of_several_effects
+from simopt_envs.gap.large import SECONDS, nearest_size, of_several_effects
 from simopt_envs.gap.plain import SPEAKS_FOR, Plain
 from simopt_envs.gap.predictive import HeldOut
 from simopt_envs.gap.refit import ITERATIONS, Refit, extended, fitted, grown
@@ -44,7 +44,6 @@ Progress = Callable[[str, int, int], None]
 """Is told what is being done, and how many of how many are done."""
 
 _FITTED_IN_FULL = 3  # candidates
-_SECONDS_OF_LARGE = 2.0  # of the worst windows, that candidates of several sizes are tried on
 _TRIED_FINELY = 4  # times as many candidates as are fitted at such a size are tried at finer ones
 _BETTER = 2.0  # nats by which a base must become better for its candidates to be fitted anew
 
@@ -257,8 +256,7 @@ class Search:
             return []
         effects = base.hypothesis.candidates
         if effects not in self._largest:
-            count = max(1, round(_SECONDS_OF_LARGE / self.data.seconds))
-            rows = np.argsort(-np.sum(base.fit.errors**2, axis=(1, 2)), kind="stable")[:count]
+            rows = base.worst(SECONDS / self.data.fitted.seconds)
             windows, noise = self.data.fitted.select(rows), base.noise.select(rows)
             start, nearest = afresh(base), []
             for done, one in enumerate(screened):

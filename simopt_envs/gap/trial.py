@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from simopt_envs.adaptation.fitting import Noise
@@ -36,7 +37,7 @@ class Data:
     @property
     def seconds(self) -> float:
         """Length of a window."""
-        return float(self.fitted.offsets[-1])
+        return self.fitted.seconds
 
     @property
     def parts(self) -> int:
@@ -91,6 +92,11 @@ class Base(Trial):
     noise: Noise
     held_out_noise: Noise
     tolerance: Array
+
+    def worst(self, count: float) -> NDArray[np.intp]:
+        """About so many of the windows fitted, at least one: those of which it leaves the most, in their order."""
+        left = np.sum(self.fit.errors**2, axis=(1, 2))
+        return np.sort(np.argsort(-left, kind="stable")[: max(1, round(count))])
 
     @property
     def sensor_noise(self) -> Array:

@@ -51,6 +51,11 @@ class Windows:
         return len(self.start_time)
 
     @property
+    def seconds(self) -> float:
+        """Length of each."""
+        return float(self.offsets[-1])
+
+    @property
     def names(self) -> tuple[str, ...]:
         """Names of the compared columns."""
         return tuple(channel.name for channel in self.channels)
