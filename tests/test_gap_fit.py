@@ -113,3 +113,20 @@ def test_a_fit_looks_beyond_a_wall(monkeypatch, looks):
     monkeypatch.setattr(misfit, "errors", errors)
     (end,) = fits.fit(misfit, np.array([4.0]), 20).u
     assert (end > 14) == (looks > 0), end
+
+
+def test_derivatives_are_taken_once_at_each_place(arm, monkeypatch):
+    """They cost two simulations a coordinate; those where a fit ends are part of what it returns."""
+    hypothesis, misfit = arm
+    start = _at(hypothesis, STIFFNESS, REST)
+    misfit = misfit.with_noise(misfit.noise_at(start, np.array([5e-4, 5e-4, 1e-3, 1e-3, 1e-3])))
+    taken, take = [], fits.Misfit.jacobian
+
+    def noted(self: fits.Misfit, u: np.ndarray, columns: Any, difference: float, chart: Chart) -> np.ndarray:
+        taken.append((difference, *u))
+        return take(self, u, columns, difference, chart)
+
+    monkeypatch.setattr(fits.Misfit, "jacobian", noted)
+    found = fits.fit(misfit, start, 5, differences=(0.3, 0.1))
+    assert len(taken) == len(set(taken)) >= 2
+    assert (0.1, *found.u) in taken

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -19,7 +21,7 @@ from simopt_envs.gap.plain import Plain, plain_parameters
 from simopt_envs.gap.recordings import read_windows, whole_recordings
 from simopt_envs.gap.search import Search
 from simopt_envs.gap.thresholds import BENT, FORGOTTEN, WILD
-from simopt_envs.gap.trial import Data
+from simopt_envs.gap.trial import Base, Data
 from simopt_envs.gap.wild_starts import without_wild_starts
 from simopt_envs.measured import Recording, WindowSimulator, cut_windows
 from simopt_envs.measured.replay import start_curvature
@@ -240,3 +242,9 @@ def test_windows_keep_off_both_ends_of_a_recording():
     data = read_windows(mujoco.MjModel.from_xml_string(MODEL), recordings)
     for windows in (data.fitted, data.held_out):
         np.testing.assert_allclose(windows.start_time, np.tile([0.14, 0.64, 1.14, 1.64], 2))
+
+
+@pytest.mark.parametrize(("count", "rows"), [(0.4, [2]), (2.0, [2, 3]), (9.0, [0, 1, 2, 3])])
+def test_starts_are_told_apart_by_the_windows_that_a_base_leaves_most_of(count, rows):
+    base: Any = SimpleNamespace(fit=SimpleNamespace(errors=np.array([1.0, 0.5, -4.0, 2.0]).reshape(4, 1, 1)))
+    np.testing.assert_array_equal(Base.worst(base, count), rows)
