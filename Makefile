@@ -33,7 +33,7 @@ hidden-effects: $(VENV)
 	.venv/bin/python -m benchmarks.hidden_effects.score --gaps $(HIDDEN)/found --labels $(HIDDEN)/labels --figure $(HIDDEN)/confusion.png
 
 hidden-effects-quick:
-	$(MAKE) hidden-effects COUNT=4
+	$(MAKE) hidden-effects COUNT=6
 
 lint: $(VENV)
 	.venv/bin/ruff check .
