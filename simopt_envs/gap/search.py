@@ -256,7 +256,7 @@ class Search:
             return []
         effects = base.hypothesis.candidates
         if effects not in self._largest:
-            rows = base.worst(SECONDS / self.data.fitted.seconds)
+            rows = base.worst(SECONDS / self.data.seconds)
             windows, noise = self.data.fitted.select(rows), base.noise.select(rows)
             start, nearest = afresh(base), []
             for done, one in enumerate(screened):
