@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -98,7 +99,19 @@ def test_far_from_the_data_what_is_taken_is_held_against_its_rivals_anew(stiffne
 def test_an_effect_is_there_if_its_interval_leaves_out_none_of_it(friction):
     search = _search(lambda q, v: np.array([0.0, -friction * np.tanh(v[1] / 0.01)]), (DRY,))
     base = search.base((DRY,))
-    assert is_there(base, DRY, base.spread(search.data)) == (friction > 0)
+    assert is_there(base.hypothesis, DRY, *base.by_all(search.data)) == (friction > 0)
+
+
+@pytest.mark.parametrize("friction", [0.02, 0.0])
+def test_windows_that_no_fit_saw_may_tell_that_an_effect_is_there(friction):
+    """In those fitted the elbow moves so little that they leave it open."""
+    search = _search(lambda q, v: np.array([0.0, -friction * np.tanh(v[1] / 0.01)]), (DRY,))
+    fitted = search.data.fitted
+    travel = np.ptp(fitted.measured[:, :, fitted.names.index("qpos/elbow")], axis=1)
+    search.data = replace(search.data, fitted=fitted.select(np.sort(np.argsort(travel)[:6])))
+    base = search.base((DRY,))
+    assert not is_there(base.hypothesis, DRY, base.fit.u, base.spread(search.data))
+    assert is_there(base.hypothesis, DRY, *base.by_all(search.data)) == (friction > 0)
 
 
 @pytest.mark.parametrize(("around_rest", "right"), [(-0.5, DRY), (1.5, PEAKED)])
@@ -116,6 +129,13 @@ def test_an_effect_gives_way_to_the_one_that_it_extends_if_what_it_adds_is_not_t
     assert {*final.hypothesis.candidates} == {right, SPRING} == {score.candidate for score in effects}
 
 
+def test_friction_that_turns_out_alike_in_both_directions_gives_way_to_coulomb_friction():
+    """It was taken while a spring was missing, which made up a difference."""
+    search = _search(lambda q, v: np.array([-3.0 * q[0], -0.5 * np.tanh(v[1] / 0.01)]), (SPRING, DRY, ONE_SIDED))
+    final, effects = search._revised(search.base((ONE_SIDED, SPRING)), [search.stage(search.base())])
+    assert {*final.hypothesis.candidates} == {DRY, SPRING} == {score.candidate for score in effects}
+
+
 @pytest.mark.parametrize("limit", [1.2, 5.0])
 def test_a_limit_is_there_where_it_acts(limit):
     """Of a limit, unlike a friction, there is no amount that could be none; the elbow's drive gives 3 N m at most."""
@@ -124,21 +144,21 @@ def test_a_limit_is_there_where_it_acts(limit):
     start = hypothesis.coordinates(hypothesis.space.values({LIMIT.full_name("limit"): limit}))
     start[: hypothesis.num_plain] = 0.0
     base = search.base((LIMIT,), start)
-    assert is_there(base, LIMIT, base.spread(search.data)) == (limit < 3)
+    assert is_there(base.hypothesis, LIMIT, *base.by_all(search.data)) == (limit < 3)
 
 
 def test_a_peak_of_friction_is_looked_for_from_where_the_fit_of_friction_without_one_ended():
-    search = _search(lambda q, v: np.array([0.0, -0.5 * np.tanh(v[1] / 0.01)]), (DRY, PEAKED, ONE_SIDED))
+    search = _search(lambda q, v: np.array([0.0, -0.5 * np.tanh(v[1] / 0.01)]), (DRY, PEAKED, SPRING))
     base = search.base()
     stage = search.stage(base)
-    peaked, one_sided = (next(s for s in stage.screened if s.candidate == c) for c in (PEAKED, ONE_SIDED))
+    peaked, spring = (next(s for s in stage.screened if s.candidate == c) for c in (PEAKED, SPRING))
     starts, of_dry = np.array(grown(peaked, stage.trials)), stage.trials[DRY].fit.u
     np.testing.assert_array_equal(starts[:, : len(base.fit.u)], np.tile(of_dry[: len(base.fit.u)], (len(starts), 1)))
     values = [peaked.hypothesis.values(PEAKED, xi) for xi in peaked.hypothesis.xi(starts)]
     assert [v["frictionloss"] for v in values] == pytest.approx([0.5] * len(values), rel=0.05)
     assert {round(v["breakaway"] / v["frictionloss"], 6) for v in values} == {1.0, 3.0}
     assert len({v["velocity"] for v in values}) == 3
-    assert grown(one_sided, stage.trials) == ()
+    assert grown(spring, stage.trials) == ()
 
 
 def test_from_another_fit_of_the_base_the_best_candidates_go_on_from_where_they_ended():

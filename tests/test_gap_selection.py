@@ -12,7 +12,7 @@ from simopt_envs.gap.hypothesis import Candidate
 from simopt_envs.gap.large import of_several_effects
 from simopt_envs.gap.recordings import split
 from simopt_envs.gap.result import judge
-from simopt_envs.gap.selection import Score, chosen, tolerance_of
+from simopt_envs.gap.selection import Score, chosen, may_be_itself, tolerance_of
 from simopt_envs.measured import Recording
 from simopt_envs.physics.effects import EFFECTS
 
@@ -64,6 +64,19 @@ def _score(parameters: int, excess: float, nats: float, fitted: float | None = N
 )
 def test_what_no_fit_saw_may_tell_of_an_effect_alone(fitted, held_out, earned):
     assert _score(1, 0.1, held_out, fitted).earned is earned
+
+
+@pytest.mark.parametrize(("width", "std", "itself"), [(0.9, 0.1, True), (1.4, 0.3, True), (1.4, 0.1, False)])
+def test_an_effect_is_what_its_name_means_if_its_interval_holds_that(width, std, itself):
+    """A peak of friction that the fit has made wider than the motion is fast, 1, is one if that is uncertain enough."""
+    effect = Candidate(EFFECTS["stribeck_friction"], "joint:elbow")
+    hypothesis: Any = SimpleNamespace(
+        columns={effect: [1, 2]},
+        low=np.array([-np.inf, 0.0, 0.0]),
+        high=np.full(3, np.inf),
+        is_itself=lambda candidate, u: candidate == effect and u[2] < 1,
+    )
+    assert may_be_itself(hypothesis, effect, np.array([0.0, 0.5, width]), np.array([9.0, 9.0, std])) is itself
 
 
 @pytest.mark.parametrize(

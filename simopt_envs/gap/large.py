@@ -9,7 +9,6 @@ import numpy as np
 from simopt_envs.adaptation.fitting import Noise
 from simopt_envs.gap.fit import Misfit
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
-from simopt_envs.gap.screen import Screened
 from simopt_envs.gap.thresholds import LARGE_REFITTED
 from simopt_envs.measured.windows import Windows
 from simopt_envs.physics.parameters import Array
@@ -17,19 +16,24 @@ from simopt_envs.physics.parameters import Array
 SECONDS = 2.0
 """Of the windows of which a base leaves the most, that sizes are tried on."""
 
-_SIZES = np.outer([-1.0, 1.0], [1.0, 3.0, 10.0, 30.0, 100.0, 300.0]).ravel()  # probes
+_SIZES = np.outer([-1.0, 1.0], [1.0, 10.0, 100.0]).ravel()  # probes
+_BETWEEN = np.array([1 / 3, 1.0, 3.0])  # of the best so far, of each of the shapes that come nearest
 _SHAPES = 3  # that a fit starts from, as starts alone tell little
 _FINER = np.geomspace([0.4, 0.9], [2.5, 1.1], 9).T  # of the best so far: where things touch, a fit from afar gets stuck
 
 
 def nearest_size(
-    screened: Screened, windows: Windows, noise: Noise, base: Array, rough: Array | None = None
+    hypothesis: Hypothesis,
+    candidate: Candidate,
+    windows: Windows,
+    noise: Noise,
+    base: Array,
+    rough: Array | None = None,
 ) -> tuple[float, Array]:
     """How far a candidate is from some windows at the size that comes nearest, or nearest around a rough one (d,).
 
     That is -log p, and the coordinates; those of the base (k,) stay.
     """
-    hypothesis, candidate = screened.hypothesis, screened.candidate
     misfit = Misfit(hypothesis, windows).with_noise(noise)
     start = np.concatenate([base, hypothesis.neutral()[len(base) :]])
     if rough is None:
@@ -56,8 +60,10 @@ def _of_each_shape(misfit: Misfit, candidate: Candidate, start: Array) -> Array:
     probes = hypothesis.probes(candidate)
     others = np.setdiff1d(np.arange(len(start)), hypothesis.columns[candidate])
     probes[:, others] = start[others]
-    tried = np.array([_scaled(hypothesis, candidate, start, probe, _SIZES) for probe in probes])
-    return best_of_each(misfit, tried)
+    for sizes in (_SIZES, _BETWEEN):
+        tried = np.array([_scaled(hypothesis, candidate, start, probe, sizes) for probe in probes])
+        probes = best_of_each(misfit, tried)
+    return probes
 
 
 def best_of_each(misfit: Misfit, starts: Array) -> Array:

@@ -22,7 +22,7 @@ from simopt_envs.gap.plain import SPEAKS_FOR, Plain
 from simopt_envs.gap.predictive import HeldOut
 from simopt_envs.gap.refit import ITERATIONS, Refit, extended, fitted, grown
 from simopt_envs.gap.screen import Screened, screen
-from simopt_envs.gap.selection import Score, chosen, is_there, score_of, tolerance_of, worth_of
+from simopt_envs.gap.selection import Score, chosen, is_there, may_be_itself, score_of, tolerance_of, worth_of
 from simopt_envs.gap.thresholds import (
     BENT,
     EVIDENCE,
@@ -176,19 +176,17 @@ class Search:
 
     def _look(self, base: Base) -> Stage:
         """A stage of those candidates alone that come nearest to the data at some size."""
-        screened = self._screened(base)
-        large = self._large(base, screened)
-        refits = self._refits(base, [s for s in screened if s.candidate in large])
-        return ranked(base, screened, self._in_full(base, screened, self.trials(base, refits)))
+        screened = self._screened(base, self._large(base))
+        return ranked(base, screened, self._in_full(base, screened, self.trials(base, self._refits(base, screened))))
 
     def stage(self, base: Base, look: Stage | None = None, before: Stage | None = None) -> Stage:
         """Screen all candidates, and fit the best, but those that a look from the same base has fitted.
 
         The best of a stage before, from another fit of the base, are fitted from where they ended there, too.
         """
-        screened = self._screened(base) if look is None else list(look.screened)
+        screened = self._screened(base)
         done = {} if look is None else look.trials
-        wanted = [*self._spoken_for(base), *self._large(base, screened)]
+        wanted = [*self._spoken_for(base), *self._large(base)]
         likely = [s.candidate for s in screened[:REFITTED_AT_MOST] if s.gain > EVIDENCE_EACH]
         promising = screened[:REFITTED] + [s for s in screened[REFITTED:] if s.candidate in (*likely, *wanted)]
         refits = self._refits(base, [one for one in promising if one.candidate not in done])
@@ -203,9 +201,10 @@ class Search:
                 far[candidate] = (*far.get(candidate, ()), afresh(base))
         return [Refit(one, far.get(one.candidate, ())) for one in promising]
 
-    def _screened(self, base: Base) -> list[Screened]:
-        """All candidates, as they would act on a base."""
-        return screen(base, self.candidates, self.data.fitted, partial(self._progress, "screen"))
+    def _screened(self, base: Base, candidates: Sequence[Candidate] | None = None) -> list[Screened]:
+        """All candidates, or some, as they would act on a base."""
+        screened = self.candidates if candidates is None else candidates
+        return screen(base, screened, self.data.fitted, partial(self._progress, "screen"))
 
     def _polished(self, stage: Stage) -> Stage:
         """A stage from the base fitted from where candidates led its parameters, if it comes out better there.
@@ -246,7 +245,7 @@ class Search:
         best = chosen(stages[0].base, without, contest.scores)
         return base if best is None or best.candidate == effect else self._sharpened(best.trial)
 
-    def _large(self, base: Base, screened: Sequence[Screened]) -> list[Candidate]:
+    def _large(self, base: Base) -> list[Candidate]:
         """The candidates that come nearest to the data at some size, where the base is far from them.
 
         The other parameters are at the priors' means, as the base may be bent, and few windows tell that much. They
@@ -259,12 +258,14 @@ class Search:
             rows = base.worst(SECONDS / self.data.seconds)
             windows, noise = self.data.fitted.select(rows), base.noise.select(rows)
             start, nearest = afresh(base), []
-            for done, one in enumerate(screened):
-                self._progress("try sizes of", done, len(screened))
-                nearest.append(nearest_size(one, windows, noise, start))
+            lacking = [c for c in self.candidates if c not in effects]
+            hypotheses = [Hypothesis(self.plain, (*effects, c), self.motion) for c in lacking]
+            for done, one in enumerate(zip(hypotheses, lacking, strict=True)):
+                self._progress("try sizes of", done, len(lacking))
+                nearest.append(nearest_size(*one, windows, noise, start))
             order = np.argsort([loss for loss, _ in nearest], kind="stable")[: _TRIED_FINELY * LARGE_REFITTED]
-            fine = [nearest_size(screened[i], windows, noise, start, nearest[i][1])[0] for i in order]
-            ordered = [screened[order[i]].candidate for i in np.argsort(fine, kind="stable")]
+            fine = [nearest_size(hypotheses[i], lacking[i], windows, noise, start, nearest[i][1])[0] for i in order]
+            ordered = [lacking[order[i]] for i in np.argsort(fine, kind="stable")]
             self._largest[effects] = of_several_effects(ordered)
         return self._largest[effects]
 
@@ -343,21 +344,23 @@ class Search:
         """Without the effects that the others have made needless, and with rivals that do more beside them instead.
 
         With it comes what each earns, most first. With and without are compared in one noise, that of the model with
-        all: what uncertain starts leave depends on the model too. An effect whose interval holds "none of it" goes as
-        well: the evidence for it is of a few stretches, and others speak against it. One of which that holds for all
-        that it adds to the effect that it extends gives way to that. What was dropped does not come back.
+        all: what uncertain starts leave depends on the model too. An effect whose interval, by all windows, holds "none
+        of it" goes as well: the evidence for it is of a few stretches, and others speak against it; so does one that is
+        not what its name means. One of which that holds for what it adds to the effect that it extends gives way to
+        that. What was dropped does not come back.
         """
         effects, earned = base.hypothesis.candidates, []
         if not effects:
             return base, ()
-        spread = base.spread(self.data)
+        hypothesis, (u, spread) = base.hypothesis, base.by_all(self.data)
         for effect in effects:
-            smaller = extended(effect, {*self.candidates} - dropped - {*effects})
-            if smaller is not None and not is_there(base, effect, spread, smaller):
+            told, smaller = (hypothesis, effect, u, spread), extended(effect, {*self.candidates} - dropped - {*effects})
+            itself = may_be_itself(*told)
+            if smaller is not None and not (itself and is_there(*told, smaller)):
                 return self._revised(self._reduced(base, effect, smaller), stages, dropped | {effect})
             without = self._without(base, effect, stages)
             score = score_of(without, effect, base, worth_of(base))
-            if not (score.earned and is_there(base, effect, spread)):
+            if not (score.needed and itself and is_there(*told)):
                 return self._revised(self.base(without.hypothesis.candidates, without.fit.u), stages, dropped)
             earned.append(score)
             rivals = stage_of(stages, effect).rivals(effect) - dropped - {*effects} if len(effects) > 1 else ()

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from simopt_envs.gap.fit import Fit
-from simopt_envs.gap.hypothesis import Candidate
+from simopt_envs.gap.hypothesis import Candidate, Hypothesis
 from simopt_envs.gap.plain import SPEAKS_FOR
 from simopt_envs.gap.thresholds import (
     COARSE,
@@ -56,7 +56,12 @@ class Score:
 
     @property
     def earned(self) -> bool:
-        """Whether it may be called missing: it must show in what was fitted, and in recordings that no fit saw.
+        """Whether it may be called missing: it is needed, and has become what its name means."""
+        return self.needed and self.trial.hypothesis.is_itself(self.candidate, self.trial.fit.u)
+
+    @property
+    def needed(self) -> bool:
+        """Whether it shows in what was fitted, and in recordings that no fit saw.
 
         The latter may tell alone, as where what was fitted hardly went where the effect acts: there is no price to pay
         for parameters that they had no part in. Less is asked of an effect that plain parameters can stand in for: all
@@ -64,11 +69,7 @@ class Score:
         """
         all_it_can = self.candidate.effect.name in SPEAKS_FOR.values() and self.was_stood_in_for
         least, in_all = (0.0, 0.0) if all_it_can else (EVIDENCE_EACH, EVIDENCE)
-        return (
-            (min(self.fitted, self.held_out) > least or self.held_out > EVIDENCE)
-            and self.total > in_all
-            and self.trial.hypothesis.is_itself(self.candidate, self.trial.fit.u)
-        )
+        return (min(self.fitted, self.held_out) > least or self.held_out > EVIDENCE) and self.total > in_all
 
 
 def chosen(null: Base, base: Base, scores: Sequence[Score]) -> Score | None:
@@ -146,14 +147,25 @@ def score_of(base: Base, candidate: Candidate, trial: Trial, worth: Array) -> Sc
     return Score(candidate, trial, float(fitted), float(held_out), of_prior)
 
 
-def is_there(base: Base, effect: Candidate, spread: Array, smaller: Candidate | None = None) -> bool:
+def is_there(
+    hypothesis: Hypothesis, effect: Candidate, u: Array, spread: Array, smaller: Candidate | None = None
+) -> bool:
     """Whether an effect's interval leaves out that there is none of it; a limit, without an amount, that it is none.
 
     With a smaller one, which it extends: none of what it adds to that.
     """
-    hypothesis = base.hypothesis
-    off = np.abs(base.fit.u - hypothesis.neutral()) > CONFIDENT * spread
+    off = np.abs(u - hypothesis.neutral()) > CONFIDENT * spread
     columns = hypothesis.amounts(effect) or hypothesis.columns[effect]
     if smaller is not None:
         columns = [i for i in hypothesis.added(effect, smaller) if i in columns]
     return bool(np.any(off[columns]))
+
+
+def may_be_itself(hypothesis: Hypothesis, effect: Candidate, u: Array, spread: Array) -> bool:
+    """Whether an effect is what its name means at some end of its parameters' intervals, if not where the fit ended.
+
+    What data tell little of, as how wide a friction's peak is, may end a little beyond.
+    """
+    steps = CONFIDENT * np.diag(spread)[hypothesis.columns[effect]]
+    ends = np.clip(np.concatenate([u[None], u - steps, u + steps]), hypothesis.low, hypothesis.high)
+    return any(hypothesis.is_itself(effect, end) for end in ends)

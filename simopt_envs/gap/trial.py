@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -123,7 +123,26 @@ class Base(Trial):
 
     def spread(self, data: Data) -> Array:
         """Standard deviation of u, (d,), by the windows that were fitted."""
-        mean_square = float(np.mean((self.held_out.errors / self.tolerance) ** 2))
-        misfit = Misfit(self.hypothesis, data.fitted).with_noise(self.noise)
-        other = misfit.jacobian(self.fit.u, difference=DIFFERENCES[1])
-        return np.sqrt(self.fit.variance(other, max(1.0, mean_square), data.parts))
+        return np.sqrt(self.fit.variance(self._other(data.fitted, self.noise), self._left, data.parts))
+
+    def by_all(self, data: Data) -> tuple[Array, Array]:
+        """u by the windows fitted and those held out together, to first order from the fit, and its spread, (d,)."""
+        weight = 1 / self.tolerance
+        errors = np.concatenate([self.fit.errors, weight * self.held_out.errors])
+        of_held_out = weight[:, None] * self.held_out.jacobian
+        jacobian = np.concatenate([self.fit.jacobian, of_held_out.reshape(-1, len(self.fit.u))])
+        other = [self._other(data.fitted, self.noise), self._other(data.held_out, self.held_out_noise)]
+        fit = replace(self.fit, errors=errors, jacobian=jacobian)
+        u = np.clip(fit.u - np.linalg.lstsq(fit.rows, fit.residual)[0], self.hypothesis.low, self.hypothesis.high)
+        stepped = replace(fit, u=u, errors=errors + (jacobian @ (u - fit.u)).reshape(errors.shape))
+        return u, np.sqrt(stepped.variance(np.concatenate(other), self._left, data.parts))
+
+    @property
+    def _left(self) -> float:
+        """Mean square of the whitened held-out errors, at least that of noise."""
+        return max(1.0, float(np.mean((self.held_out.errors / self.tolerance) ** 2)))
+
+    def _other(self, windows: Windows, noise: Noise) -> Array:
+        """The Jacobian on some windows over other differences than the fit's."""
+        misfit = Misfit(self.hypothesis, windows).with_noise(noise)
+        return misfit.jacobian(self.fit.u, difference=DIFFERENCES[1])

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from simopt_envs.gap.explanation import Stage
-from simopt_envs.gap.fit import Misfit, fit
+from simopt_envs.gap.fit import DIFFERENCES, Misfit, fit
 from simopt_envs.gap.hypothesis import Hypothesis
 from simopt_envs.gap.refit import ITERATIONS
 from simopt_envs.gap.thresholds import LARGE, OUTLYING, WILD
@@ -66,5 +66,5 @@ def without_starts_told_wild(stage: Stage, data: Data) -> Data:
             return data
         misfit = Misfit(hypothesis, left.fitted)
         misfit = misfit.with_noise(misfit.noise_at(u, base.sensor_noise))
-        u = fit(misfit, afresh(nearest), ITERATIONS).u
+        u = fit(misfit, afresh(nearest), ITERATIONS, differences=DIFFERENCES[:2]).u
     return left

@@ -20,6 +20,7 @@ class AsymmetricFriction(Effect):
 
     name = "asymmetric_friction"
     law = "f = -(F + D/2 sign(v)) sign(v)"
+    extends = "coulomb_friction"
 
     def places(self, model: mujoco.MjModel) -> tuple[str, ...]:
         """See :meth:`Effect.places`."""
@@ -46,6 +47,11 @@ class AsymmetricFriction(Effect):
         """See :meth:`Effect.probes`."""
         force = probe_force(model, object_name(place), motion)
         return tuple({"frictionloss": force, "difference": difference} for difference in (force, -force))
+
+    def grown(self, model: mujoco.MjModel, place: str, motion: Motion, values: Values) -> tuple[dict[str, float], ...]:
+        """See :meth:`Effect.grown`."""
+        friction = values["frictionloss"]
+        return tuple({"frictionloss": friction, "difference": difference} for difference in (friction, -friction))
 
     def is_itself(self, model: mujoco.MjModel, place: str, motion: Motion, values: Values) -> bool:
         """A difference below half the level is what a symmetric friction and a constant force are called.
