@@ -20,7 +20,7 @@ from baselines.commands.gap_demo import _joined
 from baselines.logged_system import LoggedSystem
 from simopt_envs.adaptation import EnvSimulator
 from simopt_envs.distributions import Gaussian
-from simopt_envs.gap import find_gap
+from simopt_envs.gap.find import find_gap, solve
 from simopt_envs.measured import load_recording
 from simopt_envs.physics import ModelWriter
 from simopt_envs.physics.effects import EFFECTS
@@ -75,6 +75,7 @@ def workplace(tmp_path, monkeypatch):
 def few_effects(monkeypatch):
     """A search of seconds, without figures."""
     monkeypatch.setattr("simopt_envs.gap.find_gap", partial(find_gap, effects=FEW))
+    monkeypatch.setattr("simopt_envs.gap.find.solve", partial(solve, effects=FEW))
     monkeypatch.setattr("simopt_envs.gap.report.write_report", lambda *_: None)
 
 
@@ -137,7 +138,7 @@ def test_what_no_parameter_explains_is_named_once(few_effects, monkeypatch, caps
     repaired.reset(seed=0)
     assert repaired.unwrapped.model.joint("joint2").damping[0] == pytest.approx(60.0, rel=0.1)
 
-    monkeypatch.setattr("simopt_envs.gap.find_gap", None)  # is not called again
+    monkeypatch.setattr("simopt_envs.gap.find.solve", None)  # is not called again
     adapt("--iterations", "0", "--resume", vary=("cabinet_x=0.02",))
     assert notes() == [note]
     assert line in capsys.readouterr().out
@@ -282,11 +283,11 @@ def test_the_search_starts_from_the_distribution_that_leaves_least(tmp_path, mon
     bent = Gaussian(space, first.mean - np.log(4.0), [[0.005**2]])
     searched = []
 
-    def search(spec, recordings, *, plain, **_):
-        searched.append((spec.compile().joint("joint2").damping[0], plain.std[0]))
+    def search(problem, **_):
+        searched.append((problem.given.compile().joint("joint2").damping[0], problem.plain.prior.std[0]))
         raise InterruptedError
 
-    monkeypatch.setattr("simopt_envs.gap.find_gap", search)
+    monkeypatch.setattr("simopt_envs.gap.find.solve", search)
     for distributions in ([bent, first], [first, bent]):
         with pytest.raises(InterruptedError):
             explain(DRAWER, distributions, logs, tmp_path / "gap", Console())

@@ -101,6 +101,9 @@ def test_a_drawer_without_an_encoder_starts_where_its_handle_shows_it():
     pushed = replace(windows.starts, qpos=windows.starts.qpos + 0.005)  # as by whoever asks what starts do
     moved = simulate(xi[1:], pushed)[0, :, 0, 0] - windows.measured[:, 0, 0]
     np.testing.assert_allclose(moved, 0.005, atol=1e-3)
+    several = hypothesis.xi(np.array([[0.0] * len(xi[0]), [1.0] + [0.0] * (len(xi[0]) - 1), [0.5] * len(xi[0])]))
+    several = np.concatenate([several, xi])
+    np.testing.assert_array_equal(simulate(several), np.concatenate([simulate(one[None]) for one in several]))
 
 
 def test_a_large_effect_is_tried_at_about_its_size(arm):

@@ -231,6 +231,23 @@ def test_a_search_never_leaves_out_more_than_half_of_its_windows_however_often_a
 
 
 @needs_effects
+@pytest.mark.parametrize("of_fitted", [False, True])
+def test_fits_stand_where_none_of_the_windows_left_out_was_fitted(of_fitted, monkeypatch):
+    plain, windows, recordings = of_pushed_rods([3.0, 3.1, 3.2, 3.3])
+    rows = np.array([0, 1, 3])
+    fewer = windows.select(rows)
+    data = Data(windows, windows, recordings, recordings)
+    left = replace(data, fitted=fewer if of_fitted else windows, held_out=fewer)
+    null = []
+    for found in (data, left):
+        monkeypatch.setattr("simopt_envs.gap.search.without_starts_told_wild", lambda *_, found=found: found)
+        null.append(Search(plain, data, motion_of(plain.model, recordings), (BIAS,)).run().null)
+    assert len(null[1].held_out_noise.shrink) == len(null[1].held_out.errors) == 3
+    assert np.array_equal(null[1].fit.u, null[0].fit.u) is not of_fitted
+    assert np.array_equal(null[1].held_out.errors, null[0].held_out.errors[rows]) is not of_fitted
+
+
+@needs_effects
 def test_a_search_needs_something_to_look_for():
     recordings = record(lambda q, v: np.zeros(2), np.random.default_rng(1))
     with pytest.raises(ValueError, match="none of the effects can act"):

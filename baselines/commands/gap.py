@@ -25,7 +25,7 @@ from baselines.commands.progress import SECONDS_BETWEEN_LINES
 from baselines.commands.recordings import existing_logs
 from simopt_envs.distributions import Gaussian
 from simopt_envs.engine import Engine
-from simopt_envs.measured import Recording, load_recording
+from simopt_envs.measured import load_recording
 from simopt_envs.physics import Parameter, ParameterSpace
 from simopt_envs.physics.spec_writer import write_spec
 
@@ -119,8 +119,9 @@ def explain(
     Raises:
         ValueError: for logs that cannot be read as recordings of the environment.
     """
-    from simopt_envs.gap import find_gap
+    from simopt_envs.gap.find import read, refitted, solve
     from simopt_envs.gap.thresholds import EXPLAINED
+    from simopt_envs.gap.trial import of_median_window
 
     if (folder / "gap.json").exists() and not (folder / _FITS).exists():
         return False
@@ -129,30 +130,16 @@ def explain(
         tried = []
         for distribution in distributions:
             spec, plain = environment(env_id, distribution)
-            tried.append((_left(spec, plain, recordings, show), spec, plain))
+            problem = read(spec, recordings, plain, keyframe=_HOME)
+            null = refitted(problem, show)
+            tried.append((of_median_window(null.held_out.errors), problem, null))
             if tried[-1][0] < EXPLAINED:
                 return True
-        _, spec, plain = min(tried, key=lambda one: one[0])
-        gap = find_gap(
-            spec, recordings, plain=plain, keyframe=_HOME, progress=show, engine=engine, directory=folder / _FITS
-        )
+        _, problem, null = min(tried, key=lambda one: one[0])
+        gap = solve(problem, progress=show, engine=engine, directory=folder / _FITS, null=null)
     gap.save(folder)
     shutil.rmtree(folder / _FITS)
     return False
-
-
-def _left(spec: mujoco.MjSpec, prior: Gaussian, recordings: Sequence[Recording], show: Shown) -> float:
-    """What a refit of plain parameters leaves in the median window held out: 1 is noise."""
-    from simopt_envs.gap.motion import motion_of
-    from simopt_envs.gap.plain import Plain
-    from simopt_envs.gap.recordings import read_windows
-    from simopt_envs.gap.search import Search
-    from simopt_envs.gap.trial import of_median_window
-
-    plain = Plain.of(spec, prior)
-    data = read_windows(plain.model, recordings, _HOME)
-    null = Search(plain, data, motion_of(plain.model, recordings, _HOME), (), show).base()
-    return of_median_window(null.held_out.errors)
 
 
 def told(folder: Path) -> str:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from simopt_envs.gap.carriers import Carrier, stretches
 from simopt_envs.physics.parameters import Array
@@ -92,27 +91,21 @@ class Regression:
         smooth = [np.eye(len(self.knots)) * _RIDGE + weight * bends.T @ bends for weight in _SMOOTHNESS]
         return size * np.array(smooth)
 
-    def solve(self, rows: NDArray[np.intp], prior: Array) -> Array:
-        """β (b,) of some recordings."""
-        return -np.linalg.solve(self.information[rows].sum(axis=0) + prior, self.slope[rows].sum(axis=0))
-
     @cached_property
     def gains(self) -> Array:
         """Squared errors that curves of the other recordings take away from each, for each prior, (p,)."""
-        everyone, gains = np.arange(len(self.slope)), np.zeros(len(self.priors))
-        for left_out in everyone:
-            for p, prior in enumerate(self.priors):
-                beta = self.solve(everyone[everyone != left_out], prior)
-                gains[p] -= 2 * self.slope[left_out] @ beta + beta @ self.information[left_out] @ beta
-        return gains
+        others = self.information.sum(axis=0) - self.information, self.slope.sum(axis=0) - self.slope
+        beta = -np.linalg.solve(others[0][:, None] + self.priors, others[1][:, None, :, None])[..., 0]
+        linear = np.einsum("rb,rpb->p", self.slope, beta)
+        return -2 * linear - np.einsum("rpb,rbc,rpc->p", beta, self.information, beta)
 
     def curve(self, r2: float) -> Curve:
         """The curve of all recordings, and of each."""
-        everyone = np.arange(len(self.slope))
         x = self.knots if len(self.knots) <= 2 else np.linspace(self.knots[0], self.knots[-1], _CURVE_POINTS)
-        hats, beta = _hats(x, self.knots), self.solve(everyone, self.priors[np.argmax(self.gains)])
+        hats, smooth = _hats(x, self.knots), self.priors[np.argmax(self.gains)]
+        beta = -np.linalg.solve(self.information.sum(axis=0) + smooth, self.slope.sum(axis=0))
         alone = []
-        for r in everyone:
+        for r in range(len(self.slope)):
             # Towards the common curve, where a recording alone does not tell.
             prior = 0.1 * np.diag(np.diag(self.information.mean(axis=0)) + 1e-12)
             own = beta - np.linalg.solve(self.information[r] + prior, self.slope[r] + self.information[r] @ beta)

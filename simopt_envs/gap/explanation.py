@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from simopt_envs.gap.hypothesis import Candidate
 from simopt_envs.gap.screen import Screened
@@ -32,6 +33,11 @@ class Stage:
     def trials(self) -> dict[Candidate, Trial]:
         """Those that were fitted."""
         return {score.candidate: score.trial for score in self.scores}
+
+    def held_against(self, rows: NDArray[np.intp]) -> Stage:
+        """The same, of some of the windows held out."""
+        trials = {candidate: trial.held_against(rows) for candidate, trial in self.trials.items()}
+        return ranked(self.base.held_against(rows), self.screened, trials)
 
     def rivals(self, effect: Candidate) -> set[Candidate]:
         """The other candidates that do nearly as much as the one that was taken, or more; none if it was not fitted."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import mujoco
@@ -36,6 +36,29 @@ from simopt_envs.physics.effects import EFFECTS, Effect, Motion, require_mujoco
 from simopt_envs.physics.effects.readings import columns
 
 _SEED = 0  # of the bootstrap
+
+
+@dataclass(frozen=True, repr=False)
+class Problem:
+    """A model and recordings that may disagree.
+
+    Attributes:
+        given: the model.
+        plain: it, with what a refit may move.
+        data: windows of the recordings, but for those in which, by the model as given, the start decides.
+        motion: of the recordings.
+        whole: the recordings in longer windows, if they are that long.
+        keyframe: where joints without a column start.
+        began: when it was read, by ``time.perf_counter``.
+    """
+
+    given: mujoco.MjSpec
+    plain: Plain
+    data: Data
+    motion: Motion
+    whole: Data | None
+    keyframe: str | None
+    began: float
 
 
 def find_gap(
@@ -71,21 +94,53 @@ def find_gap(
         ValueError: for a model that does not compile, recordings that do not fit it, audits that found errors,
             effects none of which can act in the model, or a directory that keeps fits of something else.
     """
+    problem = read(model, recordings, plain, mapping, keyframe)
+    return solve(problem, effects=effects, progress=progress, engine=engine, directory=directory)
+
+
+def read(
+    model: str | Path | mujoco.MjSpec,
+    recordings: Sequence[str | Path | Recording],
+    plain: Gaussian | None = None,
+    mapping: LogMapping | str | Path | None = None,
+    keyframe: str | None = None,
+) -> Problem:
+    """What :func:`find_gap` is given, read and checked."""
     require_mujoco()
     began = time.perf_counter()
     given = _spec(model)
     start = plain_parameters(given) if plain is None else Plain.of(given, plain)
-    read = [
+    logs = [
         r for item in recordings for r in ([item] if isinstance(item, Recording) else load_recordings(item, mapping))
     ]
-    data = read_windows(start.model, read, keyframe)
-    motion = motion_of(start.model, read, keyframe)
-    seen = tuple(c for effect in effects for c in _places(effect, start.model) if _shows(c, start.model, data.fitted))
+    data = read_windows(start.model, logs, keyframe)
+    motion = motion_of(start.model, logs, keyframe)
     whole = whole_recordings(start.model, data, keyframe)
     with _silent_warnings():
         data = _without_wild_starts(start, data, motion)
-        explanation = Search(start, data, motion, seen, progress, engine, directory, whole).run()
-        return _gap(given, explanation, data, keyframe, began)
+    return Problem(given, start, data, motion, whole, keyframe, began)
+
+
+def refitted(problem: Problem, progress: Progress = lambda *_: None) -> Base:
+    """The model with its plain parameters fitted, which a search begins with."""
+    with _silent_warnings():
+        return Search(problem.plain, problem.data, problem.motion, (), progress).base()
+
+
+def solve(
+    problem: Problem,
+    effects: Sequence[Effect] = tuple(EFFECTS.values()),
+    progress: Progress = lambda *_: None,
+    engine: Engine | None = None,
+    directory: str | Path | None = None,
+    null: Base | None = None,
+) -> Gap:
+    """What is missing, see :func:`find_gap`; ``null``, if it is there already, is what :func:`refitted` gives."""
+    plain, data = problem.plain, problem.data
+    seen = tuple(c for effect in effects for c in _places(effect, plain.model) if _shows(c, plain.model, data.fitted))
+    with _silent_warnings():
+        search = Search(plain, data, problem.motion, seen, progress, engine, directory, problem.whole, null)
+        return _gap(problem, search.run())
 
 
 def _without_wild_starts(plain: Plain, data: Data, motion: Motion) -> Data:
@@ -106,9 +161,9 @@ def _silent_warnings() -> Iterator[None]:
         mujoco.set_mju_user_warning(before)
 
 
-def _gap(given: mujoco.MjSpec, explanation: Explanation, short: Data, keyframe: str | None, began: float) -> Gap:
+def _gap(problem: Problem, explanation: Explanation) -> Gap:
     """What was found; where the model errs, and on what that depends, is told from short windows in any case."""
-    verdict = judge(explanation)
+    verdict, short = judge(explanation), problem.data
     null, unforeseen = explanation.null, explanation.final.unforeseen
     explained = explanation if verdict != "unexplained" else replace(explanation, final=null, effects=())
     final = explained.final
@@ -116,12 +171,12 @@ def _gap(given: mujoco.MjSpec, explanation: Explanation, short: Data, keyframe: 
     fitted = [base.hypothesis.xi(base.fit.u[None])[0] for base in (null, final)]
     models = [(null.hypothesis, as_given), (null.hypothesis, fitted[0]), (final.hypothesis, fitted[1])]
     errors = held_out_errors(explanation.data.held_out, models, null.sensor_noise, np.random.default_rng(_SEED))
-    spec, diff = repair(explained, given, fitted[1])
+    spec, diff = repair(explained, problem.given, fitted[1])
     rows = localise(short.held_out, _left_by(null, short.held_out).errors, null.hypothesis.plain.model)
     residuals = [_left_by(final, windows) for windows in (short.fitted, short.held_out)]
     left = describe(final.hypothesis, final.fit.u, residuals)
-    named = separate(named_effects(explained), explained, keyframe)
-    seconds = time.perf_counter() - began
+    named = separate(named_effects(explained), explained, problem.keyframe)
+    seconds = time.perf_counter() - problem.began
     return Gap(verdict, named, errors, rows, left, explained, unforeseen, spec, diff, seconds)
 
 

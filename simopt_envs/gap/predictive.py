@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from simopt_envs.gap.fit import Fit, Misfit
 from simopt_envs.physics.parameters import Array
@@ -40,6 +41,10 @@ class HeldOut:
         first = 0 if known is None else known.shape[-1]
         taken = tolerance[:, None] * misfit.jacobian(u, range(first, len(u))).reshape(*errors.shape, -1)
         return cls(errors, taken if known is None else np.concatenate([known, taken], axis=-1))
+
+    def select(self, rows: NDArray[np.intp]) -> HeldOut:
+        """Those of some windows."""
+        return HeldOut(self.errors[rows], self.jacobian[rows])
 
     def surprise(self, known: Array, worth: Array) -> float:
         """-log p of the held-out data given the fitted ones, up to a constant that all models share; see above.

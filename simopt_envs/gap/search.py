@@ -61,6 +61,7 @@ class Search:
         directory: keeps finished fits, from which a search of the same goes on; None for none.
         whole: the recordings in longer windows, which are fitted instead where the model predicts as much; None for
             never.
+        null: what :meth:`base` gives without effects, if it is there already.
     """
 
     def __init__(
@@ -73,11 +74,13 @@ class Search:
         engine: Engine | None = None,
         directory: str | Path | None = None,
         whole: Data | None = None,
+        null: Base | None = None,
     ):
         self.plain, self.data, self.motion, self.candidates = plain, data, motion, tuple(candidates)
         self._whole, self._progress, self._engine = whole, progress, engine or LocalEngine()
         self._kept = kept_fits(directory, plain, motion, data.fitted, data.held_out)
-        self._floor: Array | None = None
+        self._null = null
+        self._floor: Array | None = None if null is None else null.sensor_noise
         self._tolerance = np.ones(len(data.fitted.channels))
         self._largest: dict[tuple[Candidate, ...], list[Candidate]] = {}
 
@@ -91,7 +94,7 @@ class Search:
             raise ValueError(
                 "there is nothing to search: none of the effects can act in this model and show in its data"
             )
-        base = self.base()
+        base = self._null or self.base()
         if self._whole is not None and self._predicts(base, self._whole):
             self.data = self._whole
             base = self.base(start=base.fit.u)
@@ -130,20 +133,24 @@ class Search:
         """The first stage, on windows whose start does not decide.
 
         Where the base is far from the data, the few candidates that come nearest at some size may tell of such windows
-        before all others are fitted.
+        before all others are fitted. Where none of these windows was fitted, fits stand.
         """
-        look = self._look(base) if base.excess >= LARGE else None
-        if look is not None and self._left_out(look):
-            return self.stage(self.base())
-        stage = self.stage(base, look)
-        return self.stage(self.base()) if self._left_out(stage) else stage
+        look = None
+        if base.excess >= LARGE:
+            look = self._without_wild(self._look(base))
+            if look is None:
+                return self.stage(self.base())
+            base = look.base
+        stage = self._without_wild(self.stage(base, look))
+        return self.stage(self.base()) if stage is None else stage
 
-    def _left_out(self, stage: Stage) -> bool:
-        """Whether there were windows to leave out whose start, as a stage tells, decides."""
+    def _without_wild(self, stage: Stage) -> Stage | None:
+        """A stage without the windows whose start, as it tells, decides; None where fits had been to some of them."""
         before, self.data = self.data, without_starts_told_wild(stage, self.data)
-        if self.data is not before:
+        if self.data.fitted is not before.fitted:
             self._largest.clear()
-        return self.data is not before
+            return None
+        return stage.held_against(before.held_out.find(self.data.held_out))
 
     def base(self, effects: Sequence[Candidate] = (), start: Array | None = None) -> Base:
         """The hypothesis of some effects, fitted with all its differences."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,6 +69,10 @@ class Trial:
         """Mean square of the whitened held-out errors above that of noise alone, which is 1."""
         return float(np.mean(self.held_out.errors**2)) - 1.0
 
+    def held_against(self, rows: NDArray[np.intp]) -> Self:
+        """The same, of some of the windows held out."""
+        return replace(self, held_out=self.held_out.select(rows))
+
 
 def afresh(trial: Trial) -> Array:
     """A trial's coordinates (d,), its plain parameters at their priors' means."""
@@ -92,6 +97,10 @@ class Base(Trial):
     noise: Noise
     held_out_noise: Noise
     tolerance: Array
+
+    def held_against(self, rows: NDArray[np.intp]) -> Self:
+        """The same, of some of the windows held out."""
+        return replace(super().held_against(rows), held_out_noise=self.held_out_noise.select(rows))
 
     def worst(self, count: float) -> NDArray[np.intp]:
         """About so many of the windows fitted, at least one: those of which it leaves the most, in their order."""

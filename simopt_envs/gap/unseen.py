@@ -6,6 +6,7 @@ import copy
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from simopt_envs.measured.states import States, depends_on_stage, read_state
 from simopt_envs.measured.windows import Windows
@@ -15,6 +16,7 @@ from simopt_envs.physics.writer import ModelWriter
 
 _DIFFERENCE = 1e-6  # rad or m: moves joints to see what sites and sensors make of it
 _EXACT = 1e-12  # rad or m: no farther from where they show it
+_OFF = 1e-3  # of a parameter, or of its logarithm: what tells whether it moves anything
 _STEPS = 10  # towards it, at most
 
 
@@ -44,6 +46,7 @@ class UnseenJoints:
             return
         self._model, self._data, self._nominal = copy.copy(model), mujoco.MjData(model), space.nominal
         self._writer = ModelWriter(self._model, space)
+        self._moving = self._that_move(space, windows.starts.qpos[0])
         self._starts, self._told = windows.starts, self._tell(windows.starts)
 
     def __bool__(self) -> bool:
@@ -63,30 +66,52 @@ class UnseenJoints:
         meant = np.stack(
             [shown_by.meant(c, xi, *told) for c, *told in zip(self._columns, shown.T, rates.T, strict=True)], axis=-1
         )
-        tangent = np.zeros(self._model.nv)
+        placed: dict[bytes, Array] = {}  # most ξ differ in nothing that sites or sensors are moved by
         for at_xi, row, wanted in zip(qpos.reshape(len(xi), len(starts), -1), xi, meant, strict=True):
-            self._writer.write_model(row[of_model], self._model, self._data)
-            for posture, gain, values in zip(at_xi, gains, wanted, strict=True):
-                for _ in range(_STEPS):
-                    tangent[self._dofs] = gain @ (values - self._read(posture))
-                    if np.max(np.abs(tangent)) < _EXACT:
-                        break
-                    mujoco.mj_integratePos(self._model, posture, tangent, 1.0)
+            told = np.concatenate([row[of_model][self._moving], wanted.ravel(), at_xi.ravel()]).tobytes()
+            if told not in placed:
+                self._writer.write_model(row[of_model], self._model, self._data)
+                self._move(at_xi, gains, wanted)
+                placed[told] = at_xi
+            at_xi[:] = placed[told]
+
+    def _move(self, postures: Array, gains: Array, wanted: Array) -> None:
+        """Move the joints of postures (w, nq), in place, to where the columns read what is wanted, (w, c)."""
+        tangent = np.zeros(self._model.nv)
+        for posture, gain, values in zip(postures, gains, wanted, strict=True):
+            for _ in range(_STEPS):
+                tangent[self._dofs] = gain @ (values - self._read(posture))
+                if np.max(np.abs(tangent)) < _EXACT:
+                    break
+                mujoco.mj_integratePos(self._model, posture, tangent, 1.0)
+
+    def _that_move(self, space: ParameterSpace, posture: Array) -> NDArray[np.intp]:
+        """Which parameters change what is read in a posture, where all others are off neutral."""
+        neutral = space.to_unconstrained(space.nominal)
+        more, less = (np.clip(space.from_unconstrained(neutral + d), space.low, space.high) for d in (_OFF, -_OFF))
+        rows = np.tile(np.where(more != space.nominal, more, less), (len(space) + 1, 1))
+        np.fill_diagonal(rows[1:], space.nominal)
+        readings = []
+        for row in rows:
+            self._writer.write_model(row, self._model, self._data)
+            readings.append(self._read(posture))
+        return np.flatnonzero(np.any(np.array(readings[1:]) != readings[0], axis=1))
 
     def _tell(self, starts: States) -> tuple[Array, Array, Array]:
         """What columns show without the effect, (w, c), its rates, and how joints follow from it, (w, joints, c)."""
         self._writer.write_model(self._nominal, self._model, self._data)
         shown = np.array([self._read(start) for start in starts.qpos])
-        rates = np.array([self._rate(*start) for start in zip(starts.qpos, starts.qvel, strict=True)])
         units = np.eye(self._model.nv)[self._dofs]
-        by_joint = np.array([[self._rate(start, unit) for unit in units] for start in starts.qpos])
+        at = list(zip(starts.qpos, shown, strict=True))
+        rates = np.array([self._rate(*here, qvel) for here, qvel in zip(at, starts.qvel, strict=True)])
+        by_joint = np.array([[self._rate(*here, unit) for unit in units] for here in at])
         return shown, rates, np.linalg.pinv(by_joint.transpose(0, 2, 1), rcond=1e-6)
 
     def _read(self, qpos: Array) -> Array:
         return read_state(self._model, self._data, qpos, np.zeros(self._model.nv), self._channels)
 
-    def _rate(self, qpos: Array, qvel: Array) -> Array:
-        """Of what is read, (c,), at a velocity (nv,)."""
+    def _rate(self, qpos: Array, shown: Array, qvel: Array) -> Array:
+        """Of what is shown in a posture, (c,), at a velocity (nv,)."""
         later = qpos.copy()
         mujoco.mj_integratePos(self._model, later, qvel, _DIFFERENCE)
-        return (self._read(later) - self._read(qpos)) / _DIFFERENCE
+        return (self._read(later) - shown) / _DIFFERENCE

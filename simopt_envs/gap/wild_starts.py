@@ -36,7 +36,8 @@ def without_wild_starts(hypothesis: Hypothesis, u: Array, data: Data, scale: Arr
         left = np.mean(misfit.with_noise(misfit.noise_at(u, scale)).errors(u[None])[0] ** 2, axis=(1, 2))
         bent = misfit.bent_by_starts(u, scale)
         wild = (bent > WILD) & (np.maximum(left, bent) > beyond * np.median(left))
-        kept.append(windows if np.mean(wild) > 0.5 else windows.select(np.flatnonzero(~wild)))
+        some = 0 < np.mean(wild) <= 0.5
+        kept.append(windows.select(np.flatnonzero(~wild)) if some else windows)
     total = len(data.fitted) + len(data.held_out)
     left_out = total - sum(map(len, kept))
     if left_out == 0:

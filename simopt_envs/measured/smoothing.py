@@ -6,6 +6,7 @@ Everything here is zero-phase: no function delays a signal.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from scipy import linalg, optimize, signal
@@ -60,37 +61,49 @@ def smooth(values: Array, period: float) -> Smoothed:
     filled = _filled(values)
     noises = {}
     for window in (w for w in _WINDOWS if w <= len(values)):
-        residual = (filled - signal.savgol_filter(filled, window, _ORDER))[~missing]
-        leverage = signal.savgol_coeffs(window, _ORDER)[window // 2]
+        residual = (filled - _filtered(filled, window))[~missing]
+        leverage = _weights(window, 0)[window // 2, window // 2]
         noises[window] = float(np.sqrt(np.mean(residual**2) / (1 - leverage)))
     stands = np.mean(np.diff(values) == 0) > _STANDING_SHARE
     floor = _NOISE_MARGIN * max(min(noises.values()), resolution(values) / np.sqrt(12) if stands else 0.0)
     window, noise = max((item for item in noises.items() if item[1] <= floor), default=(_WINDOWS[0], floor))
     value, velocity, acceleration = (
-        np.where(missing, np.nan, signal.savgol_filter(filled, window, _ORDER, deriv=d, delta=period)) for d in range(3)
+        np.where(missing, np.nan, _filtered(filled, window, d) / period**d) for d in range(3)
     )
-    value_error, velocity_error = (noise * _filter_norms(len(values), window, d, period) for d in range(2))
+    value_error, velocity_error = (noise * _filter_norms(len(values), window, d) / period**d for d in range(2))
     return Smoothed(value, velocity, acceleration, noise, value_error, velocity_error)
+
+
+@cache
+def _weights(window: int, derivative: int) -> Array:
+    """What each of a window's samples counts in the filtered value at each, (window, window), of a period of 1."""
+    return np.array(
+        [signal.savgol_coeffs(window, _ORDER, derivative, pos=position, use="dot") for position in range(window)]
+    )
+
+
+def _filtered(values: Array, window: int, derivative: int = 0) -> Array:
+    """As by :func:`scipy.signal.savgol_filter`, with weights that are computed once: (T,), by samples.
+
+    Near the ends, the polynomial is that of the first or last window.
+    """
+    weights, half = _weights(window, derivative), window // 2
+    first = np.sum(weights[:half] * values[:window], axis=1)
+    last = np.sum(weights[-half:] * values[-window:], axis=1)
+    return np.concatenate([first, np.correlate(values, weights[half]), last])
+
+
+def _filter_norms(samples: int, window: int, derivative: int) -> Array:
+    """Norm of the filter that gives each of the smoothed samples, (T,), of a period of 1."""
+    weights, half = _weights(window, derivative), window // 2
+    norms = np.linalg.norm(weights, axis=1)
+    return np.concatenate([norms[:half], np.full(samples - 2 * half, norms[half]), norms[-half:]])
 
 
 def _filled(values: Array) -> Array:
     """With straight lines where NaN was."""
     index, missing = np.arange(len(values)), np.isnan(values)
     return np.interp(index, index[~missing], values[~missing]) if missing.any() else values
-
-
-def _filter_norms(samples: int, window: int, derivative: int, period: float) -> Array:
-    """Norm of the filter that gives each of the smoothed samples, (T,); near the ends the polynomial is of the end."""
-
-    def norm(position: int) -> float:
-        weights = signal.savgol_coeffs(window, _ORDER, derivative, period, pos=position, use="dot")
-        return float(np.linalg.norm(weights))
-
-    half = window // 2
-    norms = np.full(samples, norm(half))
-    norms[:half] = [norm(position) for position in range(half)]
-    norms[samples - half :] = norms[:half][::-1]
-    return norms
 
 
 def smooth_with_rate(position: Array, velocity: Array, period: float) -> Smoothed:

@@ -67,6 +67,12 @@ class Windows:
         recording = tuple(self.recording[row] for row in rows)
         return replace(self, recording=recording, starts=self.starts.select(rows), **taken)
 
+    def find(self, others: Windows) -> NDArray[np.intp]:
+        """Where some of them are among all, (k,)."""
+        wanted = set(zip(others.recording, others.start_time.tolist(), strict=True))
+        own = zip(self.recording, self.start_time.tolist(), strict=True)
+        return np.array([row for row, one in enumerate(own) if one in wanted], dtype=np.intp)
+
     def channel_scale(self) -> Array:
         """Standard deviation of each channel over all windows, (c,): what normalised errors are relative to."""
         return np.nanstd(self.measured.reshape(-1, len(self.channels)), axis=0)
