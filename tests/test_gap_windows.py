@@ -250,7 +250,7 @@ def test_fits_stand_where_none_of_the_windows_left_out_was_fitted(of_fitted, mon
 @needs_effects
 def test_a_search_needs_something_to_look_for():
     recordings = record(lambda q, v: np.zeros(2), np.random.default_rng(1))
-    with pytest.raises(ValueError, match="none of the effects can act"):
+    with pytest.raises(ValueError, match="no effect can act"):
         find_gap(mujoco.MjSpec.from_string(MODEL), recordings, effects=[EFFECTS["contact_friction"]])
 
 

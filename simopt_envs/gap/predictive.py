@@ -43,8 +43,8 @@ class HeldOut:
         return cls(errors, taken if known is None else np.concatenate([known, taken], axis=-1))
 
     def select(self, rows: NDArray[np.intp]) -> HeldOut:
-        """Those of some windows."""
-        return HeldOut(self.errors[rows], self.jacobian[rows])
+        """Those of some windows, laid out alike whatever they come from: sums depend on that in their last digits."""
+        return HeldOut(np.ascontiguousarray(self.errors[rows]), np.ascontiguousarray(self.jacobian[rows]))
 
     def surprise(self, known: Array, worth: Array) -> float:
         """-log p of the held-out data given the fitted ones, up to a constant that all models share; see above.

@@ -91,9 +91,7 @@ class Search:
             ValueError: without candidates.
         """
         if not self.candidates:
-            raise ValueError(
-                "there is nothing to search: none of the effects can act in this model and show in its data"
-            )
+            raise ValueError("there is nothing to search: no effect can act in this model and show in its data")
         base = self._null or self.base()
         if self._whole is not None and self._predicts(base, self._whole):
             self.data = self._whole
@@ -147,6 +145,8 @@ class Search:
     def _without_wild(self, stage: Stage) -> Stage | None:
         """A stage without the windows whose start, as it tells, decides; None where fits had been to some of them."""
         before, self.data = self.data, without_starts_told_wild(stage, self.data)
+        if self.data is before:
+            return stage
         if self.data.fitted is not before.fitted:
             self._largest.clear()
             return None
