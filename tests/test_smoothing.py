@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from scipy.signal import savgol_filter
 
 from simopt_envs.measured.resample import resolution
-from simopt_envs.measured.smoothing import smooth, smooth_with_rate
+from simopt_envs.measured.smoothing import _filtered, smooth, smooth_with_rate
 
 PERIOD = 0.002
 
@@ -96,3 +97,11 @@ def test_what_was_not_measured_counts_for_nothing():
         np.testing.assert_array_equal(smooth_with_rate(holed, unknown, PERIOD).velocity, smooth(holed, PERIOD).velocity)
     with pytest.raises(ValueError, match="at least 5 samples, got 3"):
         smooth_with_rate(np.zeros(3), np.zeros(3), PERIOD)
+
+
+@pytest.mark.parametrize("window", [5, 23, 61])
+@pytest.mark.parametrize("derivative", [0, 1, 2])
+def test_filters_are_those_of_savitzky_and_golay_to_the_ends(window, derivative):
+    values = np.random.default_rng(0).standard_normal(61).cumsum()
+    expected = savgol_filter(values, window, 3, deriv=derivative)
+    np.testing.assert_allclose(_filtered(values, window, derivative), expected, rtol=1e-9, atol=1e-9)
