@@ -274,7 +274,7 @@ def _spring(plant: Plant, joint: str, m: float, same: bool, rng: np.random.Gener
 
 def _detent(plant: Plant, joint: str, m: float, same: bool, rng: np.random.Generator) -> Built:
     width = 0.06 * scales(plant.name).range[joint]
-    return laws.Detent(joint, m, width, 0.0, sharp=not same), {"force": m, "width": width}
+    return laws.Detent(joint, m, width, 0.0, sharp=rng.random() < 0.5), {"force": m, "width": width}
 
 
 def _cogging(plant: Plant, joint: str, m: float, same: bool, rng: np.random.Generator) -> Built:
@@ -401,7 +401,7 @@ EFFECTS: dict[str, Effect] = {
         Effect("joint_elasticity", "joint", _elasticity, BOTH, lambda p, j: 0.05 * _compliance(p, j),
                _compliance, True, sets_apart=True),
         Effect("joint_spring", "joint", _spring, BOTH, _per("range", 0.02, 1), _per("range", 1.5, 1)),
-        Effect("detent", "joint", _detent, BOTH, of_force(0.03), of_force(0.7)),
+        Effect("detent", "joint", _detent, OTHER, of_force(0.03), of_force(0.7)),
         Effect("cogging", "joint", _cogging, BOTH, of_force(0.02), of_force(0.5), True),
         Effect("joint_coupling", "pair", _coupling, BOTH,
                lambda p, pair: _per("range", 0.02, 1)(p, pair.split("+")[1]),

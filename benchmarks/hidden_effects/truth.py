@@ -15,9 +15,11 @@ from benchmarks.hidden_effects.plants import Array, Feedback, Motion, Plant, nom
 
 TIMESTEP = 5e-4
 MAX_LATENCY = 2e-3
-HALF_STEP_LEAD = (2e-3 - TIMESTEP) / 2
-"""Semi-implicit Euler runs ahead of time by half a step: to match this system the nominal model with its longer steps
-needs a latency that is longer by the difference. Latencies are given here as the nominal model sees them."""
+HALF_STEP = TIMESTEP / 2
+"""Semi-implicit Euler's positions are ahead of its velocities by half a step: instruments read those of before."""
+HALF_STEP_LEAD = 2e-3 / 2
+"""The same of the nominal model, which needs a latency that is longer by it to match this system. Latencies are given
+here as the nominal model sees them."""
 
 
 class Diverged(RuntimeError):
@@ -240,7 +242,8 @@ class World:
         """A column as a perfect instrument would read it at these times."""
         kind, what, *rest = name.split("/")
         if kind == "qpos":
-            return np.interp(time, self._fine_time, self._fine_encoders[:, self._encoder_names.index(what)])
+            encoder = self._fine_encoders[:, self._encoder_names.index(what)]
+            return np.interp(time - HALF_STEP, self._fine_time, encoder)
         site = self.model.site(what).id
         axis = "xyz".index(rest[0]) if kind == "site" else int(rest[0])
         return self._site_path(time)[:, site, axis]
@@ -250,7 +253,7 @@ class World:
         key = (time.tobytes(), self._fine_qpos.ctypes.data)
         if self._sites_at is None or self._sites_at[0] != key:
             data, path = mujoco.MjData(self.model), np.empty((len(time), self.model.nsite, 3))
-            joints = [np.interp(time, self._fine_time, q) for q in self._fine_qpos.T]
+            joints = [np.interp(time - HALF_STEP, self._fine_time, q) for q in self._fine_qpos.T]
             for i, qpos in enumerate(np.stack(joints, axis=1)):
                 data.qpos[:] = qpos
                 mujoco.mj_kinematics(self.model, data)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import mujoco
@@ -11,6 +12,7 @@ import numpy as np
 
 from simopt_envs.gap.plain import INTEGRATION_LEAD, Plain
 from simopt_envs.gap.starts import loads, starts_of
+from simopt_envs.gap.thresholds import FARTHEST
 from simopt_envs.gap.unseen import UnseenJoints
 from simopt_envs.measured.channels import Channel, model_channels
 from simopt_envs.measured.states import States, depends_on_stage
@@ -90,6 +92,8 @@ class Hypothesis:
         self.prior_std = np.full(len(nominal), _FREE)
         self.prior_std[: self.num_plain] = 1.0
         self.low, self.high = (self.coordinates(bound) for bound in (self.space.low, self.space.high))
+        within = np.where(np.arange(len(nominal)) < self.num_plain, FARTHEST, np.inf)
+        self.low, self.high = np.maximum(self.low, -within), np.minimum(self.high, within)
 
     def xi(self, u: Array) -> Array:
         """Coordinates (n, d) -> physical values, within the bounds."""
@@ -243,7 +247,7 @@ class HypothesisSimulator:
         starts = self.windows.starts if starts is None else starts
         true = self._simulate(xi[:, self._of_model], self._meant(starts, xi), self._arriving(xi))
         lead = np.sum(xi[:, self._lead], axis=1)[:, None, None, None]
-        true[..., self._ahead] -= lead * np.gradient(true[..., self._ahead], self._period, axis=2)
+        true[..., self._ahead] = _without_lead(true[..., self._ahead], lead, self._period)
         return self._columns.shown(true, xi, self._period) if self._columns else true
 
     def _is_scalar(self, channel: Channel) -> bool:
@@ -290,6 +294,12 @@ class HypothesisSimulator:
                 values = self._hypothesis.values(candidate, row)
                 for name, position in candidate.effect.rest(candidate.place, values, self._loads).items():
                     at_xi[:, int(self._model.joint(name).qposadr[0])] += position
+
+
+def _without_lead(ahead: Array, lead: Array, period: float) -> Array:
+    """Positions x (n, w, S, c) of which these are x + lead x', to second order in the lead, (n, 1, 1, 1)."""
+    rate = partial(np.gradient, axis=2, edge_order=2)
+    return ahead - lead * rate(ahead - lead * rate(ahead, period), period)
 
 
 def _is_position(model: mujoco.MjModel, channel: Channel) -> bool:

@@ -17,7 +17,7 @@ seeds 11000 had been run; since seeds 12000 had, and after seed 1 of the gap dem
 leaves is excused. Since seeds 13000 had, the candidates that ``REFITTED`` and ``REFITTED_AT_MOST`` count come in
 another order: by gain less price (one case). Since seeds 16000 had, what ``CONFIDENT`` asks of an effect is asked by
 all windows, not by those fitted alone (one case), and the interval may hold what its name means, not the fit alone (one
-case).
+case). ``FARTHEST`` is new since seeds 17000 had (four cases).
 """
 
 EVIDENCE = 20.0
@@ -54,6 +54,10 @@ neutral in some parameter that says how much of it there is."""
 
 FAR = 3.5
 """Standard deviations from its prior's mean from which a plain parameter speaks for an effect."""
+
+FARTHEST = 4.0
+"""Standard deviations from its prior's mean that a plain parameter may go. Where errors are many times the noise, a
+prior alone costs nothing beside them, and parameters went 20 of its deviations to stand in for what is missing."""
 
 REFITTED = 6
 """Candidates of the screen that are fitted in any case."""

@@ -7,6 +7,7 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
 from scipy.stats import chi2
 
 from simopt_envs.adaptation.fitting import Noise
@@ -142,7 +143,8 @@ class Base(Trial):
         jacobian = np.concatenate([self.fit.jacobian, of_held_out.reshape(-1, len(self.fit.u))])
         other = [self._other(data.fitted, self.noise), self._other(data.held_out, self.held_out_noise)]
         fit = replace(self.fit, errors=errors, jacobian=jacobian)
-        u = np.clip(fit.u - np.linalg.lstsq(fit.rows, fit.residual)[0], self.hypothesis.low, self.hypothesis.high)
+        within = self.hypothesis.low - fit.u, self.hypothesis.high - fit.u
+        u = fit.u + lsq_linear(fit.rows, -fit.residual, within, method="bvls").x
         stepped = replace(fit, u=u, errors=errors + (jacobian @ (u - fit.u)).reshape(errors.shape))
         return u, np.sqrt(stepped.variance(np.concatenate(other), self._left, data.parts))
 
