@@ -273,6 +273,7 @@ def _spring(plant: Plant, joint: str, m: float, same: bool, rng: np.random.Gener
 
 
 def _detent(plant: Plant, joint: str, m: float, same: bool, rng: np.random.Generator) -> Built:
+    """Of two laws, neither of which is the library's triangle."""
     width = 0.06 * scales(plant.name).range[joint]
     return laws.Detent(joint, m, width, 0.0, sharp=rng.random() < 0.5), {"force": m, "width": width}
 
