@@ -22,7 +22,7 @@ from simopt_envs.gap.hypothesis import Candidate, Hypothesis
 from simopt_envs.gap.localise import localise
 from simopt_envs.gap.motion import motion_of
 from simopt_envs.gap.plain import Plain, plain_parameters
-from simopt_envs.gap.recordings import read_windows, whole_recordings
+from simopt_envs.gap.recordings import longer_windows, read_windows
 from simopt_envs.gap.result import Gap, judge, named_effects, repair
 from simopt_envs.gap.search import Progress, Search
 from simopt_envs.gap.separate import separate
@@ -47,7 +47,7 @@ class Problem:
         plain: it, with what a refit may move.
         data: windows of the recordings, but for those in which, by the model as given, the start decides.
         motion: of the recordings.
-        whole: the recordings in longer windows, if they are that long.
+        longer: the recordings in longer windows, the longest first, if they are that long.
         keyframe: where joints without a column start.
         began: when it was read, by ``time.perf_counter``.
     """
@@ -56,7 +56,7 @@ class Problem:
     plain: Plain
     data: Data
     motion: Motion
-    whole: Data | None
+    longer: tuple[Data, ...]
     keyframe: str | None
     began: float
 
@@ -115,10 +115,10 @@ def read(
     ]
     data = read_windows(start.model, logs, keyframe)
     motion = motion_of(start.model, logs, keyframe)
-    whole = whole_recordings(start.model, data, keyframe)
     with _silent_warnings():
         data = _without_wild_starts(start, data, motion)
-    return Problem(given, start, data, motion, whole, keyframe, began)
+    longer = longer_windows(start.model, data, keyframe)
+    return Problem(given, start, data, motion, longer, keyframe, began)
 
 
 def refitted(problem: Problem, progress: Progress = lambda *_: None) -> Base:
@@ -139,7 +139,7 @@ def solve(
     plain, data = problem.plain, problem.data
     seen = tuple(c for effect in effects for c in _places(effect, plain.model) if _shows(c, plain.model, data.fitted))
     with _silent_warnings():
-        search = Search(plain, data, problem.motion, seen, progress, engine, directory, problem.whole, null)
+        search = Search(plain, data, problem.motion, seen, progress, engine, directory, problem.longer, null)
         return _gap(problem, search.run())
 
 

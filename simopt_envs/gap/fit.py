@@ -185,25 +185,16 @@ class Misfit:
         starts = start_sensitivity(self.hypothesis.model, self._simulate, self.hypothesis.xi(u[None]))
         return Noise.of(scale, np.where(self._counted, np.nan_to_num(starts), 0.0))
 
-    def late_by_starts(self, u: Array, scale: Array) -> Array:
-        """What uncertain starts make of the second half of each window at u (d,), mean squares in a noise (c,), (w,).
-
-        Infinite where a simulation ran away.
-        """
-        made = self._by_starts(start_sensitivity, u, scale)
-        return np.nan_to_num(np.mean(made[:, made.shape[1] // 2 :], axis=(1, 2)), nan=np.inf)
-
     def bent_by_starts(self, u: Array, scale: Array) -> Array:
-        """The same of whole windows, of what is not linear in the starts, and so not in the noise, (w,).
+        """What uncertain starts make of windows beyond the linear, and so not in the noise, at u (d,), (w,).
 
-        Over two standard errors as well as over one: something, as a finger that catches, may happen beyond the first.
+        Mean squares in a noise (c,), infinite where a simulation ran away. Over two standard errors as well as over
+        one: something, as a finger that catches, may happen beyond the first.
         """
-        made = [self._by_starts(partial(start_curvature, errors=errors), u, scale) for errors in (1.0, 2.0)]
+        model, xi = self.hypothesis.model, self.hypothesis.xi(u[None])
+        changes = [start_curvature(model, self._simulate, xi, errors=errors) for errors in (1.0, 2.0)]
+        made = np.where(self._counted, np.sum((np.array(changes) / scale) ** 2, axis=1), 0.0)
         return np.nan_to_num(np.max(np.mean(made, axis=(2, 3)), axis=0), nan=np.inf)
-
-    def _by_starts(self, response: Callable[..., Array], u: Array, scale: Array) -> Array:
-        changes = response(self.hypothesis.model, self._simulate, self.hypothesis.xi(u[None]))
-        return np.where(self._counted, np.sum((changes / scale) ** 2, axis=0), 0.0)
 
     def noise_floor(self, u: Array) -> Array:
         """Standard deviation of the part of the errors at u (d,) that one sample does not share with the next, (c,).

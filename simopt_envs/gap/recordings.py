@@ -9,7 +9,7 @@ from functools import partial
 import mujoco
 import numpy as np
 
-from simopt_envs.gap.thresholds import LONG_WINDOW, WINDOW
+from simopt_envs.gap.thresholds import LEAST_LEFT, LONG_WINDOW, WINDOW
 from simopt_envs.gap.trial import Data
 from simopt_envs.measured.audit import audited
 from simopt_envs.measured.recording import Finding, Recording, warnings_of
@@ -18,7 +18,6 @@ from simopt_envs.physics.effects.actuator_delay import LONGEST
 
 _GUARD = 0.5  # seconds between what is fitted of a single recording and what is held out
 _FITTED = 0.6  # share of a single recording that is fitted
-_LEAST_LEFT = 0.75  # of what short windows hold, that long ones must hold
 
 
 def split(recordings: Sequence[Recording]) -> tuple[list[Recording], list[Recording], tuple[Finding, ...]]:
@@ -75,28 +74,32 @@ def read_windows(model: mujoco.MjModel, recordings: Sequence[Recording], keyfram
     )
 
 
-def whole_recordings(model: mujoco.MjModel, data: Data, keyframe: str | None = None) -> Data | None:
-    """The same recordings as a whole or, where they are longer than ``LONG_WINDOW``, in equal parts.
+def longer_windows(model: mujoco.MjModel, data: Data, keyframe: str | None = None) -> tuple[Data, ...]:
+    """The same recordings in longer windows, the longest first: whole ones, their halves, and thirds.
 
-    None where that is no longer than they are cut already, or where gaps leave too little of them.
+    Of a recording longer than ``LONG_WINDOW``, equal parts of it count as whole. Left out is what is not twice as long
+    as recordings are cut already, and of which gaps leave too little.
     """
     period = float(data.fitted.offsets[1])
     shortest = min(r.duration for r in (*data.fitted_recordings, *data.held_out_recordings))
     samples = int(shortest / period + 1e-6)
-    seconds = samples // int(np.ceil(samples * period / LONG_WINDOW)) * period
-    if seconds < 2 * data.seconds:
-        return None
+    samples //= int(np.ceil(samples * period / LONG_WINDOW))
 
-    def longer(windows: Windows, recordings: Sequence[Recording]) -> Windows | None:
+    def longer(windows: Windows, recordings: Sequence[Recording], seconds: float) -> Windows | None:
         try:
             cut = cut_windows(model, recordings, seconds, keyframe=keyframe, history=2 * LONGEST)
         except ValueError:
             return None
-        return cut if len(cut) * seconds > _LEAST_LEFT * len(windows) * data.seconds else None
+        return cut if len(cut) * seconds >= LEAST_LEFT * len(windows) * data.seconds else None
 
-    fitted = longer(data.fitted, data.fitted_recordings)
-    held_out = longer(data.held_out, data.held_out_recordings)
-    return None if fitted is None or held_out is None else replace(data, fitted=fitted, held_out=held_out)
+    found = []
+    for seconds in (samples // parts * period for parts in (1, 2, 3)):
+        if seconds >= 2 * data.seconds:
+            fitted = longer(data.fitted, data.fitted_recordings, seconds)
+            held_out = longer(data.held_out, data.held_out_recordings, seconds)
+            if fitted is not None and held_out is not None:
+                found.append(replace(data, fitted=fitted, held_out=held_out))
+    return tuple(found)
 
 
 def _liveliness(recording: Recording) -> float:

@@ -24,11 +24,9 @@ from simopt_envs.gap.refit import ITERATIONS, Refit, extended, fitted, grown
 from simopt_envs.gap.screen import Screened, screen
 from simopt_envs.gap.selection import Score, chosen, is_there, may_be_itself, score_of, tolerance_of, worth_of
 from simopt_envs.gap.thresholds import (
-    BENT,
     EVIDENCE,
     EVIDENCE_EACH,
     FAR,
-    FORGOTTEN,
     LARGE,
     LARGE_REFITTED,
     MOST_EFFECTS,
@@ -36,7 +34,7 @@ from simopt_envs.gap.thresholds import (
     REFITTED_AT_MOST,
 )
 from simopt_envs.gap.trial import Base, Data, Trial, afresh
-from simopt_envs.gap.wild_starts import without_starts_told_wild
+from simopt_envs.gap.wild_starts import as_predicted, without_starts_told_wild
 from simopt_envs.physics.effects import Motion
 from simopt_envs.physics.parameters import Array
 
@@ -59,8 +57,7 @@ class Search:
         progress: is told of it.
         engine: fits the candidates; this process by default.
         directory: keeps finished fits, from which a search of the same goes on; None for none.
-        whole: the recordings in longer windows, which are fitted instead where the model predicts as much; None for
-            never.
+        longer: the recordings in longer windows, the longest first; the first in which the model is near are fitted.
         null: what :meth:`base` gives without effects, if it is there already.
     """
 
@@ -73,11 +70,11 @@ class Search:
         progress: Progress = lambda *_: None,
         engine: Engine | None = None,
         directory: str | Path | None = None,
-        whole: Data | None = None,
+        longer: Sequence[Data] = (),
         null: Base | None = None,
     ):
         self.plain, self.data, self.motion, self.candidates = plain, data, motion, tuple(candidates)
-        self._whole, self._progress, self._engine = whole, progress, engine or LocalEngine()
+        self._longer, self._progress, self._engine = tuple(longer), progress, engine or LocalEngine()
         self._kept = kept_fits(directory, plain, motion, data.fitted, data.held_out)
         self._null = null
         self._floor: Array | None = None if null is None else null.sensor_noise
@@ -93,10 +90,7 @@ class Search:
         if not self.candidates:
             raise ValueError("there is nothing to search: no effect can act in this model and show in its data")
         base = self._null or self.base()
-        if self._whole is not None and self._predicts(base, self._whole):
-            self.data = self._whole
-            base = self.base(start=base.fit.u)
-        stage = self._first(base)
+        stage = self._first(self._in_longer_windows(base))
         self._tolerance = tolerance_of(min((score.trial for score in stage.scores), key=lambda trial: trial.excess))
         if np.any(self._tolerance > 1):  # only now it is known that nothing comes near the sensors' noise
             stage = self.stage(self.base(start=self._led_to(stage)))
@@ -111,21 +105,18 @@ class Search:
         final, effects = self._revised(base, stages)
         return Explanation(null, final, effects, tuple(stages), self.data)
 
-    @staticmethod
-    def _predicts(base: Base, longer: Data) -> bool:
-        """Whether a base is near enough to the data to be held against longer windows of them.
+    def _in_longer_windows(self, base: Base) -> Base:
+        """A base fitted to the longest windows that it predicts, and of which, fitted, it leaves no large error.
 
-        They tell more, as what a model lacks adds up and as fewer starts are uncertain. But a start must be forgotten,
-        as where servos hold a robot, or a small error grows into a large one; what it does must be linear, as it is not
-        where contacts slip; and a model that is far off gets lost on the way.
+        They tell more than short ones, as what a model lacks adds up. So does what a law of another form leaves.
         """
-        if base.excess >= LARGE:
-            return False
-        for windows in (longer.fitted, longer.held_out):
-            misfit, at = Misfit(base.hypothesis, windows), (base.fit.u, base.sensor_noise)
-            if np.median(misfit.late_by_starts(*at)) > FORGOTTEN or np.mean(misfit.bent_by_starts(*at)) > BENT:
-                return False
-        return True
+        short = self.data
+        for longer in filter(None, map(partial(as_predicted, base), self._longer)):
+            self.data = longer
+            if (found := self.base(start=base.fit.u)).excess < LARGE:
+                return found
+        self.data = short
+        return base
 
     def _first(self, base: Base) -> Stage:
         """The first stage, on windows whose start does not decide.

@@ -28,6 +28,7 @@ class Data:
         fitted, held_out: the windows.
         fitted_recordings, held_out_recordings: what they are cut from.
         warnings: of the recordings' audit.
+        wild: the windows left out as all depends on how exactly they start: the recording, and from when to when [s].
     """
 
     fitted: Windows
@@ -35,6 +36,7 @@ class Data:
     fitted_recordings: tuple[Recording, ...]
     held_out_recordings: tuple[Recording, ...]
     warnings: tuple[Finding, ...] = ()
+    wild: tuple[tuple[str, float, float], ...] = ()
 
     @property
     def seconds(self) -> float:

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from simopt_envs.gap.explanation import Stage
 from simopt_envs.gap.fit import DIFFERENCES, Misfit, fit
 from simopt_envs.gap.hypothesis import Hypothesis
 from simopt_envs.gap.refit import ITERATIONS
-from simopt_envs.gap.thresholds import LARGE, OUTLYING, WILD
-from simopt_envs.gap.trial import Data, afresh, of_median_window
+from simopt_envs.gap.thresholds import BENT, LARGE, LEAST_LEFT, OUTLYING, WILD
+from simopt_envs.gap.trial import Base, Data, afresh, of_median_window
 from simopt_envs.measured.recording import Finding
+from simopt_envs.measured.windows import Windows
 from simopt_envs.physics.parameters import Array
 
 
@@ -36,15 +39,8 @@ def without_wild_starts(hypothesis: Hypothesis, u: Array, data: Data, scale: Arr
         left = np.mean(misfit.with_noise(misfit.noise_at(u, scale)).errors(u[None])[0] ** 2, axis=(1, 2))
         bent = misfit.bent_by_starts(u, scale)
         wild = (bent > WILD) & (np.maximum(left, bent) > beyond * np.median(left))
-        some = 0 < np.mean(wild) <= 0.5
-        kept.append(windows.select(np.flatnonzero(~wild)) if some else windows)
-    total = len(data.fitted) + len(data.held_out)
-    left_out = total - sum(map(len, kept))
-    if left_out == 0:
-        return data
-    message = f"{left_out} of {total} left out, where all depends on how exactly they start"
-    warning = Finding.warning("windows", "start", message)
-    return replace(data, fitted=kept[0], held_out=kept[1], warnings=(*data.warnings, warning))
+        kept.append(~wild if np.mean(wild) <= 0.5 else np.full(len(wild), True))
+    return _of_those(data, *kept)
 
 
 def without_starts_told_wild(stage: Stage, data: Data) -> Data:
@@ -69,3 +65,45 @@ def without_starts_told_wild(stage: Stage, data: Data) -> Data:
         misfit = misfit.with_noise(misfit.noise_at(u, base.sensor_noise))
         u = fit(misfit, afresh(nearest), ITERATIONS, differences=DIFFERENCES[:2]).u
     return left
+
+
+def as_predicted(base: Base, longer: Data) -> Data | None:
+    """Longer windows without those in which a start decides; None where a base is not near enough to the data.
+
+    That may be the start of a short window in them. What uncertain starts do must be linear, as it is not where
+    contacts slip, and a model that is far off gets lost on the way.
+    """
+    both = longer.fitted, longer.held_out
+    kept = [~_overlap(windows, longer.wild) for windows in both]
+    if base.excess >= LARGE or np.mean(np.concatenate(kept)) < LEAST_LEFT:
+        return None
+    for windows, rows in zip(both, kept, strict=True):
+        bent = Misfit(base.hypothesis, windows).bent_by_starts(base.fit.u, base.sensor_noise)
+        rows &= bent <= WILD
+        if not rows.any() or np.mean(bent[rows]) > BENT:
+            return None
+    return _of_those(longer, *kept) if np.mean(np.concatenate(kept)) >= LEAST_LEFT else None
+
+
+def _of_those(data: Data, fitted: NDArray[np.bool_], held_out: NDArray[np.bool_]) -> Data:
+    """The windows that are told, (w,) of each, and a warning that the others are left out."""
+    kept = np.concatenate([fitted, held_out])
+    if np.all(kept):
+        return data
+    message = f"{np.sum(~kept)} of {len(kept)} left out, where all depends on how exactly they start"
+    warning = Finding.warning("windows", "start", message)
+    few, wild = [], list(data.wild)
+    for windows, rows in ((data.fitted, fitted), (data.held_out, held_out)):
+        few.append(windows.select(np.flatnonzero(rows)))
+        starts = windows.start_time.tolist()
+        wild += [(windows.recording[i], starts[i], starts[i] + windows.seconds) for i in np.flatnonzero(~rows)]
+    return replace(data, fitted=few[0], held_out=few[1], warnings=(*data.warnings, warning), wild=tuple(wild))
+
+
+def _overlap(windows: Windows, stretches: Sequence[tuple[str, float, float]]) -> NDArray[np.bool_]:
+    """Which windows share time with any of some stretches of recordings, (w,)."""
+    within = np.zeros(len(windows), dtype=bool)
+    for name, begin, end in stretches:
+        of_it = np.array(windows.recording) == name
+        within |= of_it & (windows.start_time < end - 1e-6) & (windows.start_time + windows.seconds > begin + 1e-6)
+    return within
