@@ -54,7 +54,7 @@ def test_surprise_is_that_of_the_predictive_distribution():
     posterior = np.linalg.inv(seen.T @ seen + np.diag(fit.prior_std**-2.0))
     predictive = multivariate_normal(cov=np.eye(errors.size) + unseen @ posterior @ unseen.T)
     shared = 0.5 * errors.size * np.log(2 * np.pi)
-    surprise = HeldOut(errors, held_out).surprise(known, worth)
+    surprise = HeldOut(errors, held_out).surprise(known, worth, (np.full(3, -np.inf), np.full(3, np.inf)))
     assert surprise == pytest.approx(-predictive.logpdf((each[:, 0] * errors).ravel()) - shared)
 
 
@@ -62,8 +62,10 @@ def test_what_fitted_data_leave_open_takes_errors_only_as_far_as_bounds_allow():
     nothing = Fit(np.zeros(1), np.zeros((1, 4, 1)), np.zeros((4, 1)), np.array([100.0]))
     held_out = HeldOut(np.full((1, 4, 1), 9.0), np.ones((1, 4, 1, 1)))  # a u of -9 would undo them
     one, free = np.ones(1), np.array([np.inf])
-    assert held_out.excused(precision(nothing, free, one)) == pytest.approx(4 * 81.0, rel=1e-3)
-    assert held_out.excused(precision(nothing, np.array([1.0]), one)) < 0.3 * 4 * 81.0
+    anywhere, near, unknown = (-free, free), (-one, one), precision(nothing, free, one)
+    assert held_out.excused(unknown, anywhere) == pytest.approx(4 * 81.0, rel=1e-3)
+    assert held_out.excused(unknown, near) == pytest.approx(4 * (81.0 - 64.0), rel=1e-3)
+    assert held_out.excused(precision(nothing, 2 * one, one), near) < 4 * (81.0 - 64.0)
 
 
 def test_plain_parameters_are_strained_by_many_a_little_as_by_one_a_lot():

@@ -1,7 +1,8 @@
 """What recordings that no fit saw say of a model: its errors there, as far as uncertain parameters do not excuse them.
 
 They may go where the fitted ones told little of a parameter. A right model then errs there by more than noise: its
-errors r have the covariance I + J P Jᵀ, J their derivative by u and P the posterior covariance of u.
+errors r have the covariance I + J P Jᵀ, J their derivative by u and P the posterior covariance of u. All of it is to
+first order, and holds no farther than u may go.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
 
 from simopt_envs.gap.fit import Fit, Misfit
 from simopt_envs.physics.parameters import Array
@@ -46,7 +48,7 @@ class HeldOut:
         """Those of some windows, laid out alike whatever they come from: sums depend on that in their last digits."""
         return HeldOut(np.ascontiguousarray(self.errors[rows]), np.ascontiguousarray(self.jacobian[rows]))
 
-    def surprise(self, known: Array, worth: Array) -> float:
+    def surprise(self, known: Array, worth: Array, within: tuple[Array, Array]) -> float:
         """-log p of the held-out data given the fitted ones, up to a constant that all models share; see above.
 
         The determinant is what foresight costs: a parameter that the fitted data left open makes all held-out data
@@ -55,21 +57,28 @@ class HeldOut:
         Args:
             known: P⁻¹, (d, d).
             worth: what a squared error of 1 is worth in each channel, (c,).
+            within: how far u may go down and up, (d,) each.
         """
-        excused, more = self._excused(known, worth)
+        excused, more = self._excused(known, worth, within)
         squares = float(worth @ np.sum(self.errors**2, axis=(0, 1)))
         spread = np.linalg.slogdet(more).logabsdet - np.linalg.slogdet(known).logabsdet
         return 0.5 * (squares - excused + float(spread))
 
-    def excused(self, known: Array) -> float:
+    def excused(self, known: Array, within: tuple[Array, Array]) -> float:
         """What the uncertainty of u takes from the sum of the squared errors."""
-        return self._excused(known, np.ones(self.errors.shape[-1]))[0]
+        return self._excused(known, np.ones(self.errors.shape[-1]), within)[0]
 
-    def _excused(self, known: Array, worth: Array) -> tuple[float, Array]:
-        """rᵀr - rᵀ(I + J P Jᵀ)⁻¹r, by Woodbury's identity, and P⁻¹ + JᵀJ."""
+    def _excused(self, known: Array, worth: Array, within: tuple[Array, Array]) -> tuple[float, Array]:
+        """rᵀr less the least of |r + J v|² + vᵀP⁻¹v over steps v of u that stay within bounds, and P⁻¹ + JᵀJ.
+
+        Were there no bounds, that is rᵀr - rᵀ(I + J P Jᵀ)⁻¹r.
+        """
         pull = np.einsum("c,wsci,wsc->i", worth, self.jacobian, self.errors)
         more = known + information(self.jacobian, worth)
-        return float(pull @ np.linalg.solve(more, pull)), more
+        root = np.linalg.cholesky(more)
+        aim = -np.linalg.solve(root, pull)
+        left = root.T @ lsq_linear(root.T, aim, within, method="bvls").x - aim
+        return float(aim @ aim - left @ left), more
 
 
 def information(jacobian: Array, weight: Array) -> Array:

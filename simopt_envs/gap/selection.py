@@ -142,7 +142,7 @@ def score_of(base: Base, candidate: Candidate, trial: Trial, worth: Array) -> Sc
     of_prior = prior(base.fit) - prior(trial.fit)
     fitted = gain(base.tolerance * base.fit.errors, base.tolerance * trial.fit.errors) + of_prior - price
     weight = worth * base.tolerance**2
-    before, after = (t.held_out.surprise(t.precision(weight), worth) for t in (base, trial))
+    before, after = (t.held_out.surprise(t.precision(weight), worth, t.within) for t in (base, trial))
     held_out = before - after + of_prior
     return Score(candidate, trial, float(fitted), float(held_out), of_prior)
 

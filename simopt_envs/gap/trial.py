@@ -68,6 +68,11 @@ class Trial:
         return precision(self.fit, self.hypothesis.high - self.hypothesis.low, weight)
 
     @property
+    def within(self) -> tuple[Array, Array]:
+        """How far u may go down and up from where the fit ended, (d,) each."""
+        return self.hypothesis.low - self.fit.u, self.hypothesis.high - self.fit.u
+
+    @property
     def excess(self) -> float:
         """Mean square of the whitened held-out errors above that of noise alone, which is 1."""
         return float(np.mean(self.held_out.errors**2)) - 1.0
@@ -131,7 +136,7 @@ class Base(Trial):
         if np.any(self.tolerance > 1) or np.mean(self.fit.errors**2) > EXPLAINED:
             return self.excess
         every = np.ones(len(self.tolerance))
-        return self.excess - self.held_out.excused(self.precision(every)) / self.held_out.errors.size
+        return self.excess - self.held_out.excused(self.precision(every), self.within) / self.held_out.errors.size
 
     def spread(self, data: Data) -> Array:
         """Standard deviation of u, (d,), by the windows that were fitted."""
@@ -145,8 +150,7 @@ class Base(Trial):
         jacobian = np.concatenate([self.fit.jacobian, of_held_out.reshape(-1, len(self.fit.u))])
         other = [self._other(data.fitted, self.noise), self._other(data.held_out, self.held_out_noise)]
         fit = replace(self.fit, errors=errors, jacobian=jacobian)
-        within = self.hypothesis.low - fit.u, self.hypothesis.high - fit.u
-        u = fit.u + lsq_linear(fit.rows, -fit.residual, within, method="bvls").x
+        u = fit.u + lsq_linear(fit.rows, -fit.residual, self.within, method="bvls").x
         stepped = replace(fit, u=u, errors=errors + (jacobian @ (u - fit.u)).reshape(errors.shape))
         return u, np.sqrt(stepped.variance(np.concatenate(other), self._left, data.parts))
 
