@@ -128,6 +128,8 @@ def test_whitening_leaves_independent_errors():
     columns = starts.reshape(3, 8)
     covariance = np.diag(np.tile(scale**2, 4)) + columns.T @ columns
     np.testing.assert_allclose(root @ covariance @ root.T, np.eye(8), atol=1e-12)
+    in_units_of_scale = np.linalg.slogdet(covariance / np.outer(*2 * [np.tile(scale, 4)])).logabsdet
+    np.testing.assert_allclose(noise.log_det, [in_units_of_scale])
 
 
 def test_what_cannot_be_fitted(model, windows):

@@ -96,6 +96,17 @@ def test_a_link_starts_where_it_rests_under_its_load(name, value):
     assert stiff > 20 * rest  # a link that did not give would show its tip elsewhere
 
 
+@pytest.mark.parametrize("name", ["joint_elasticity", "backlash", "load_dependent_friction"])
+def test_a_joint_that_an_effect_adds_starts_as_exactly_as_the_one_that_it_is_added_to(arm, name):
+    plain, data, motion = arm
+    hypothesis = Hypothesis(plain, [Candidate(EFFECTS[name], "joint:shoulder")], motion)
+    given, starts = data.fitted.starts, hypothesis.simulator(data.fitted).windows.starts
+    shoulder, elbow = (hypothesis.model.joint(joint).dofadr[0] for joint in ("shoulder", "elbow"))
+    (new,) = set(range(hypothesis.model.nv)) - {shoulder, elbow}
+    for of_all, of_given in ((starts.qpos_error, given.qpos_error), (starts.qvel_error, given.qvel_error)):
+        np.testing.assert_array_equal(of_all[:, [shoulder, elbow, new]], of_given[:, [0, 1, 0]])
+
+
 def test_a_drawer_without_an_encoder_starts_where_its_handle_shows_it():
     plain = plain_parameters(mujoco.MjSpec.from_string(_DRAWER))
     candidate, offset = Candidate(EFFECTS["frame_offset"], "site:handle"), 0.01

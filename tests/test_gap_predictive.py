@@ -47,20 +47,20 @@ def test_surprise_is_that_of_the_predictive_distribution():
     rng = np.random.default_rng(0)
     fitted, held_out = rng.normal(size=(6, 4, 2, 3)), rng.normal(size=(5, 4, 2, 3))
     errors, worth = rng.normal(size=(5, 4, 2)), np.array([1.0, 0.3])
-    fit = Fit(np.zeros(3), rng.normal(size=(6, 4, 2)), fitted.reshape(-1, 3), np.array([1.0, 2.0, 100.0]))
+    fit = Fit(np.zeros(3), rng.normal(size=(6, 4, 2)), fitted.reshape(-1, 3), np.array([1.0, 2.0, 100.0]), np.zeros(6))
     known = precision(fit, np.full(3, np.inf), worth)
     each = np.sqrt(worth)[:, None]
     seen, unseen = ((each * jacobian).reshape(-1, 3) for jacobian in (fitted, held_out))
     posterior = np.linalg.inv(seen.T @ seen + np.diag(fit.prior_std**-2.0))
     predictive = multivariate_normal(cov=np.eye(errors.size) + unseen @ posterior @ unseen.T)
     shared = 0.5 * errors.size * np.log(2 * np.pi)
-    surprise = HeldOut(errors, held_out).surprise(known, worth, (np.full(3, -np.inf), np.full(3, np.inf)))
+    surprise = HeldOut(errors, held_out, np.zeros(5)).surprise(known, worth, (np.full(3, -np.inf), np.full(3, np.inf)))
     assert surprise == pytest.approx(-predictive.logpdf((each[:, 0] * errors).ravel()) - shared)
 
 
 def test_what_fitted_data_leave_open_takes_errors_only_as_far_as_bounds_allow():
-    nothing = Fit(np.zeros(1), np.zeros((1, 4, 1)), np.zeros((4, 1)), np.array([100.0]))
-    held_out = HeldOut(np.full((1, 4, 1), 9.0), np.ones((1, 4, 1, 1)))  # a u of -9 would undo them
+    nothing = Fit(np.zeros(1), np.zeros((1, 4, 1)), np.zeros((4, 1)), np.array([100.0]), np.zeros(1))
+    held_out = HeldOut(np.full((1, 4, 1), 9.0), np.ones((1, 4, 1, 1)), np.zeros(1))  # a u of -9 would undo them
     one, free = np.ones(1), np.array([np.inf])
     anywhere, near, unknown = (-free, free), (-one, one), precision(nothing, free, one)
     assert held_out.excused(unknown, anywhere) == pytest.approx(4 * 81.0, rel=1e-3)

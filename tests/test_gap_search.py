@@ -12,13 +12,14 @@ from conftest import needs_effects
 from gap_plant import MODEL, Law, record
 
 from simopt_envs.gap.explanation import ranked
+from simopt_envs.gap.fit import Misfit
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
 from simopt_envs.gap.motion import motion_of
 from simopt_envs.gap.plain import plain_parameters
 from simopt_envs.gap.recordings import read_windows
 from simopt_envs.gap.refit import Refit, grown
 from simopt_envs.gap.search import Search
-from simopt_envs.gap.selection import is_there
+from simopt_envs.gap.selection import is_there, score_of
 from simopt_envs.gap.thresholds import LARGE
 from simopt_envs.physics.effects import EFFECTS
 
@@ -69,6 +70,25 @@ def test_a_fit_goes_on_from_elsewhere_only_if_that_ends_better():
     assert periods_from(with_periods(21.0)) == pytest.approx(21.0, rel=0.02)
     assert periods_from() == pytest.approx(29.3, rel=0.01)
     assert periods_from(with_periods(40.0)) == pytest.approx(29.3, rel=0.01)
+
+
+def test_a_candidate_that_is_fitted_further_has_the_noise_of_its_own_starts():
+    search = _search(lambda q, v: np.array([0.0, -0.5 * np.tanh(v[1] / 0.01)]), (DRY,))
+    base = search.base()
+    (screened,) = search._screened(base)
+    (first,) = search.trials(base, [Refit(screened)]).values()
+    (trial,) = search.trials(base, [Refit(screened, near=first.fit.u)]).values()
+    misfit = Misfit(trial.hypothesis, search.data.fitted)
+    own = misfit.noise_at(first.fit.u, base.noise.scale)
+    np.testing.assert_array_equal(first.fit.log_det, base.noise.log_det)
+    np.testing.assert_array_equal(trial.fit.log_det, own.log_det)
+    np.testing.assert_allclose(trial.fit.errors, misfit.with_noise(own).errors(trial.fit.u[None])[0])
+    assert abs(np.sum(trial.held_out.log_det) - np.sum(base.held_out.log_det)) > 0.1
+    gain = 0.5 * (np.sum(base.fit.errors**2) - np.sum(trial.fit.errors**2))
+    score = score_of(base, DRY, trial, np.ones(len(base.tolerance)))
+    price = 0.5 * np.log(base.fit.errors.size)
+    of_starts = 0.5 * float(np.sum(base.fit.log_det) - np.sum(trial.fit.log_det))
+    assert score.fitted == pytest.approx(gain + of_starts + score.of_prior - price)
 
 
 @pytest.mark.parametrize(("difference", "right"), [(0.5, ONE_SIDED), (0.0, DRY)])

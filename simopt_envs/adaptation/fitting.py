@@ -58,6 +58,11 @@ class Noise:
         basis, size, _ = np.linalg.svd(columns, full_matrices=False)
         return cls(scale, basis, 1 - 1 / np.sqrt(1 + size**2))
 
+    @property
+    def log_det(self) -> Array:
+        """Of each window's covariance, in units of the scale, (w,)."""
+        return -2 * np.sum(np.log1p(-self.shrink), axis=1)
+
     def select(self, rows: NDArray[np.intp]) -> Noise:
         """That of some windows, in the order given."""
         return Noise(self.scale, self.basis[rows], self.shrink[rows])

@@ -48,7 +48,12 @@ class Stage:
 
 def ranked(base: Base, screened: Sequence[Screened], trials: Mapping[Candidate, Trial]) -> Stage:
     """A stage from what was screened and fitted: errors count by what the best trial makes of them."""
-    best = min(trials.values(), key=lambda t: t.fit.loss + 0.5 * np.sum((t.held_out.errors / base.tolerance) ** 2))
+
+    def loss(trial: Trial) -> float:
+        told = trial.held_out
+        return trial.fit.loss + 0.5 * float(np.sum((told.errors / base.tolerance) ** 2) + np.sum(told.log_det))
+
+    best = min(trials.values(), key=loss)
     worth = worth_of(best)
     scores = [score_of(base, candidate, trial, worth) for candidate, trial in trials.items()]
     return Stage(base, tuple(screened), tuple(sorted(scores, key=lambda score: -score.total)))

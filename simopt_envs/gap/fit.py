@@ -40,22 +40,20 @@ class Fit:
         errors: whitened errors of the data there, (w, S, c); 0 where nothing was measured.
         jacobian: their derivative by u, (w S c, d).
         prior_std: of u, (d,).
+        log_det: of the covariance that errors are whitened by, (w,).
     """
 
     u: Array
     errors: Array
     jacobian: Array
     prior_std: Array
-
-    @property
-    def chi2(self) -> float:
-        """Sum of the squared whitened errors."""
-        return float(np.sum(self.errors**2))
+    log_det: Array
 
     @property
     def loss(self) -> float:
         """-log p(u | data), up to a constant."""
-        return 0.5 * (self.chi2 + float(np.sum((self.u / self.prior_std) ** 2)))
+        squares = float(np.sum(self.errors**2)) + float(np.sum((self.u / self.prior_std) ** 2))
+        return 0.5 * (squares + float(np.sum(self.log_det)))
 
     @property
     def rows(self) -> Array:
@@ -272,7 +270,7 @@ def fit(
         rows = derivatives(x)
     u = chart.bent(x)
     errors = misfit.errors(u[None])[0]
-    return Fit(u, errors, chart.by_u(rows[: errors.size], u), hypothesis.prior_std)
+    return Fit(u, errors, chart.by_u(rows[: errors.size], u), hypothesis.prior_std, misfit.noise.log_det)
 
 
 class _Derivatives:

@@ -24,10 +24,12 @@ class HeldOut:
     Attributes:
         errors: whitened, in units of the sensors' noise, (w, S, c).
         jacobian: their derivative by u, (w, S, c, d).
+        log_det: of the covariance that they are whitened by, (w,).
     """
 
     errors: Array
     jacobian: Array
+    log_det: Array
 
     @classmethod
     def of(cls, misfit: Misfit, u: Array, tolerance: Array, known: Array | None = None) -> HeldOut:
@@ -42,11 +44,12 @@ class HeldOut:
         errors = tolerance * misfit.errors(u[None])[0]
         first = 0 if known is None else known.shape[-1]
         taken = tolerance[:, None] * misfit.jacobian(u, range(first, len(u))).reshape(*errors.shape, -1)
-        return cls(errors, taken if known is None else np.concatenate([known, taken], axis=-1))
+        jacobian = taken if known is None else np.concatenate([known, taken], axis=-1)
+        return cls(errors, jacobian, misfit.noise.log_det)
 
     def select(self, rows: NDArray[np.intp]) -> HeldOut:
         """Those of some windows, laid out alike whatever they come from: sums depend on that in their last digits."""
-        return HeldOut(np.ascontiguousarray(self.errors[rows]), np.ascontiguousarray(self.jacobian[rows]))
+        return HeldOut(*(np.ascontiguousarray(of_all[rows]) for of_all in (self.errors, self.jacobian, self.log_det)))
 
     def surprise(self, known: Array, worth: Array, within: tuple[Array, Array]) -> float:
         """-log p of the held-out data given the fitted ones, up to a constant that all models share; see above.
@@ -62,7 +65,7 @@ class HeldOut:
         excused, more = self._excused(known, worth, within)
         squares = float(worth @ np.sum(self.errors**2, axis=(0, 1)))
         spread = np.linalg.slogdet(more).logabsdet - np.linalg.slogdet(known).logabsdet
-        return 0.5 * (squares - excused + float(spread))
+        return 0.5 * (squares - excused + float(spread) + float(np.sum(self.log_det)))
 
     def excused(self, known: Array, within: tuple[Array, Array]) -> float:
         """What the uncertainty of u takes from the sum of the squared errors."""

@@ -53,7 +53,8 @@ def fitted(refit: Refit, base: Base, windows: Windows, held_out: Windows, num_th
     Derivatives by what the base has are known from there. Where the base is far from the data or from its priors, the
     candidate is fitted at the size that it would need, too: with what speaks for it taken away, and with all plain
     parameters at their priors' means; derivatives by these are taken once, there. A base that an effect has bent is the
-    end of a valley that leads away from the right one. A fit that goes on from another takes them all at each step.
+    end of a valley that leads away from the right one. A fit that goes on from another takes them all at each step, and
+    counts errors in its own noise: what uncertain starts leave depends on the model, as friction brings them to rest.
 
     Starts are told apart by those windows alone of which the base leaves the most, then fitted to all.
     """
@@ -80,11 +81,16 @@ def fitted(refit: Refit, base: Base, windows: Windows, held_out: Windows, num_th
         found = fit(misfit, coarse[best], ITERATIONS, known=known, differences=DIFFERENCES[1:])
     else:
         others = [_coarsely(half, u, half.jacobian(u, of_base, DIFFERENCES[0])) for u in refit.others]
-        found = fit(misfit, misfit.best(np.array([refit.near, *others])), ITERATIONS, differences=DIFFERENCES[1:])
-    test = Misfit(hypothesis, held_out, num_threads).with_noise(base.held_out_noise)
-    foreseen = base.held_out.jacobian if refit.near is None else None
+        start = misfit.best(np.array([refit.near, *others]))
+        misfit = misfit.with_noise(misfit.noise_at(start, base.noise.scale))
+        found = fit(misfit, start, ITERATIONS, differences=DIFFERENCES[1:])
+    test, foreseen = Misfit(hypothesis, held_out, num_threads), None
+    if refit.near is None:
+        test, foreseen = test.with_noise(base.held_out_noise), base.held_out.jacobian
+    else:
+        test = test.with_noise(test.noise_at(found.u, base.held_out_noise.scale))
     told = HeldOut.of(test, found.u, base.tolerance, foreseen)
-    return {**vars(found), "held_out": told.errors, "held_out_jacobian": told.jacobian}
+    return {**vars(found), **{f"held_out_{name}": array for name, array in vars(told).items()}}
 
 
 def _coarsely(misfit: Misfit, start: Array, known: Array) -> Array:

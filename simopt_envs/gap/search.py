@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
 
@@ -309,7 +309,7 @@ class Search:
         trials = {}
         for i, (key, refit) in enumerate(zip(keys, refits, strict=True)):
             arrays = self._kept.phase(key, partial(found.__getitem__, i))
-            held_out = HeldOut(arrays.pop("held_out"), arrays.pop("held_out_jacobian"))
+            held_out = HeldOut(**{f.name: arrays.pop(f"held_out_{f.name}") for f in fields(HeldOut)})
             trials[refit.screened.candidate] = Trial(refit.screened.hypothesis, Fit(**arrays), held_out)
         return trials
 

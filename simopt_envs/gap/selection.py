@@ -140,7 +140,8 @@ def score_of(base: Base, candidate: Candidate, trial: Trial, worth: Array) -> Sc
     added = len(trial.fit.u) - len(base.fit.u)
     price = 0.5 * added * np.log(base.fit.errors.size)
     of_prior = prior(base.fit) - prior(trial.fit)
-    fitted = gain(base.tolerance * base.fit.errors, base.tolerance * trial.fit.errors) + of_prior - price
+    of_starts = 0.5 * float(np.sum(base.fit.log_det) - np.sum(trial.fit.log_det))
+    fitted = gain(base.tolerance * base.fit.errors, base.tolerance * trial.fit.errors) + of_starts + of_prior - price
     weight = worth * base.tolerance**2
     before, after = (t.held_out.surprise(t.precision(weight), worth, t.within) for t in (base, trial))
     held_out = before - after + of_prior

@@ -145,7 +145,7 @@ class _Experiment:
         u, misfit = final.fit.u, Misfit(final.hypothesis, windows)
         misfit = misfit.with_noise(misfit.noise_at(u, final.sensor_noise * final.tolerance))
         errors = misfit.errors(u[None])[0]
-        fit = Fit(u, errors, misfit.jacobian(u), final.fit.prior_std)
+        fit = Fit(u, errors, misfit.jacobian(u), final.fit.prior_std, misfit.noise.log_det)
         return cls(windows, misfit.noise, final.hypothesis, fit)
 
     def windows_of(self, recording: Recording) -> NDArray[np.intp]:

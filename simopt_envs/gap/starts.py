@@ -12,29 +12,30 @@ from simopt_envs.physics.effects import object_name
 from simopt_envs.physics.effects.joints import scalar_joints
 from simopt_envs.physics.parameters import Array
 
-_NEW_JOINT_ERROR = 1e-3  # rad or m, rad/s or m/s: how well it is known where a joint that an effect adds starts
-
 
 def starts_of(model: mujoco.MjModel, starts: States, given: mujoco.MjModel) -> States:
-    """The starts of the model as given in a model with more joints, those at their reference."""
+    """The starts of the model as given in a model with more joints, those at their reference.
+
+    A joint that an effect adds, ``NAME.what``, starts as exactly where it is thought to as the joint ``NAME`` does.
+    """
     if given.nq == model.nq:
         return starts
     w = len(starts)
     qpos = np.tile(reference_qpos(model), (w, 1))
     qvel, qacc = np.zeros((2, w, model.nv))
-    errors = [np.full((w, model.nv), _NEW_JOINT_ERROR) for _ in range(2)]
-    for j in range(given.njnt):
-        new = model.joint(given.joint(j).name)
-        old = given.joint(j)
-        qpos[:, new.qposadr[0] : new.qposadr[0] + len(old.qpos0)] = starts.qpos[
-            :, old.qposadr[0] : old.qposadr[0] + len(old.qpos0)
-        ]
-        of_new = slice(new.dofadr[0], new.dofadr[0] + len(old.damping))
-        of_old = slice(old.dofadr[0], old.dofadr[0] + len(old.damping))
-        sources = starts.qvel, starts.qpos_error, starts.qvel_error, starts.qacc
-        for target, source in zip((qvel, *errors, qacc), sources, strict=True):
-            target[:, of_new] = source[:, of_old]
-    return States(qpos, qvel, errors[0], errors[1], qacc)
+    qpos_error, qvel_error = np.empty((2, w, model.nv))
+    for j in range(model.njnt):
+        new, name = model.joint(j), model.joint(j).name
+        added = mujoco.mj_name2id(given, mujoco.mjtObj.mjOBJ_JOINT, name) < 0
+        old = given.joint(name.rpartition(".")[0] if added else name)
+        of_new = slice(new.dofadr[0], new.dofadr[0] + len(new.damping))
+        of_old = slice(old.dofadr[0], old.dofadr[0] + len(new.damping))
+        qpos_error[:, of_new], qvel_error[:, of_new] = starts.qpos_error[:, of_old], starts.qvel_error[:, of_old]
+        if not added:
+            qvel[:, of_new], qacc[:, of_new] = starts.qvel[:, of_old], starts.qacc[:, of_old]
+            of_old = slice(old.qposadr[0], old.qposadr[0] + len(old.qpos0))
+            qpos[:, new.qposadr[0] : new.qposadr[0] + len(new.qpos0)] = starts.qpos[:, of_old]
+    return States(qpos, qvel, qpos_error, qvel_error, qacc)
 
 
 def loads(model: mujoco.MjModel, windows: Windows) -> dict[str, Array]:
