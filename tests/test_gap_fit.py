@@ -11,6 +11,7 @@ import pytest
 from conftest import needs_effects
 from gap_plant import MODEL, record
 
+from simopt_envs.adaptation.fitting import Noise
 from simopt_envs.gap import fit as fits
 from simopt_envs.gap.chart import Chart
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
@@ -103,7 +104,7 @@ def test_a_fit_looks_beyond_a_wall(monkeypatch, looks):
         num_plain=0, low=-bounds, high=bounds, prior_std=bounds, products=[], reach=np.ones_like
     )
     misfit = object.__new__(fits.Misfit)
-    misfit.hypothesis = hypothesis
+    misfit.hypothesis, misfit.noise = hypothesis, Noise.of(np.ones(1), np.zeros((1, 1, 20, 1)))
     samples = np.linspace(-1.0, 1.0, 20)
 
     def errors(u: np.ndarray) -> np.ndarray:
