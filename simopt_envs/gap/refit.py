@@ -59,7 +59,8 @@ def fitted(refit: Refit, base: Base, windows: Windows, held_out: Windows, num_th
     Starts are told apart by those windows alone of which the base leaves the most, then fitted to all.
     """
     screened, hypothesis = refit.screened, refit.screened.hypothesis
-    misfit = Misfit(hypothesis, windows, num_threads).with_noise(base.noise)
+    misfit, test = (Misfit(hypothesis, some, num_threads) for some in (windows, held_out))
+    misfit = misfit.with_noise(base.noise)
     rows, of_base = base.worst(len(windows) / 2), range(len(base.fit.u))
 
     def on(some: NDArray[np.intp]) -> Misfit:
@@ -79,17 +80,14 @@ def fitted(refit: Refit, base: Base, windows: Windows, held_out: Windows, num_th
         near = best < len(starts)
         known = base.fit.jacobian if near else misfit.jacobian(coarse[best], of_base, DIFFERENCES[0])
         found = fit(misfit, coarse[best], ITERATIONS, known=known, differences=DIFFERENCES[1:])
+        told_in, foreseen = base.held_out_noise, base.held_out.jacobian
     else:
         others = [_coarsely(half, u, half.jacobian(u, of_base, DIFFERENCES[0])) for u in refit.others]
         start = misfit.best(np.array([refit.near, *others]))
         misfit = misfit.with_noise(misfit.noise_at(start, base.noise.scale))
         found = fit(misfit, start, ITERATIONS, differences=DIFFERENCES[1:])
-    test, foreseen = Misfit(hypothesis, held_out, num_threads), None
-    if refit.near is None:
-        test, foreseen = test.with_noise(base.held_out_noise), base.held_out.jacobian
-    else:
-        test = test.with_noise(test.noise_at(found.u, base.held_out_noise.scale))
-    told = HeldOut.of(test, found.u, base.tolerance, foreseen)
+        told_in, foreseen = test.noise_at(found.u, base.held_out_noise.scale), None
+    told = HeldOut.of(test.with_noise(told_in), found.u, base.tolerance, foreseen)
     return {**vars(found), **{f"held_out_{name}": array for name, array in vars(told).items()}}
 
 
