@@ -8,6 +8,7 @@ import pytest
 from effect_arm import ARM, STEPS, TIMESTEP, with_effect
 
 from simopt_envs.physics.effects import EFFECTS
+from simopt_envs.physics.effects.joints import on_bearing
 
 pytest.importorskip("mujoco.batch", reason="effects need MuJoCo >= 3.17")
 
@@ -88,4 +89,29 @@ def test_elasticity_and_backlash_can_be_in_series() -> None:
     spec = mujoco.MjSpec.from_string(ARM)
     for name in ("joint_elasticity", "backlash"):
         EFFECTS[name].add(spec, "joint:elbow")
-    assert spec.compile().nv == 5
+    model = spec.compile()
+    assert model.nv == 5
+    assert model.tendon_num[model.tendon("elbow.bearing").id] == 3
+
+
+def test_damping_of_a_joint_slows_the_link_not_the_motor() -> None:
+    """A link of 2 kg in its play, damped by 5 N s/m: v = v0 exp(-t 5/2), and the motor rests."""
+    model = with_effect("backlash", "joint:drive", {"play": 0.02}, FREE_DRIVE.replace('damping="0"', 'damping="5"'))
+    data = mujoco.MjData(model)
+    motor, link = (model.joint(name).dofadr[0] for name in ("drive", "drive.play"))
+    data.qvel[link] = 0.01
+    mujoco.mj_step(model, data, 100)
+    assert data.qvel[link] == pytest.approx(0.01 * np.exp(-2.5 * 100 * TIMESTEP), rel=1e-2)
+    assert data.qvel[motor] == pytest.approx(0.0, abs=1e-4)
+
+
+def test_what_resists_a_joint_is_written_to_its_bearing_where_it_has_one() -> None:
+    loose = with_effect("backlash", "joint:elbow", {"play": 0.02})
+    friction = EFFECTS["coulomb_friction"].parameters(loose, "joint:elbow")[0]
+    (write,) = on_bearing(loose, friction).writes
+    assert (write.field, write.object) == ("tendon_frictionloss", "elbow.bearing")
+    assert write.operation == friction.writes[0].operation
+    firm = mujoco.MjModel.from_xml_string(ARM)
+    assert on_bearing(firm, friction) == friction
+    elsewhere = EFFECTS["coulomb_friction"].parameters(loose, "joint:drive")[0]
+    assert on_bearing(loose, elsewhere) == elsewhere

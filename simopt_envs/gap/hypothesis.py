@@ -20,7 +20,7 @@ from simopt_envs.measured.windows import Windows, WindowSimulator
 from simopt_envs.physics.columns import ColumnModel, CommandModel, acts_on_columns
 from simopt_envs.physics.effects import Effect, Motion, object_name
 from simopt_envs.physics.effects.actuators import actuators, command_sources, on_all_parts
-from simopt_envs.physics.effects.joints import scalar_joints
+from simopt_envs.physics.effects.joints import on_bearing, scalar_joints
 from simopt_envs.physics.parameters import Array, Parameter, ParameterSpace
 
 _FREE = 100.0  # an effect's parameter has a prior this many probes wide: none to speak of
@@ -70,10 +70,10 @@ class Hypothesis:
         for candidate in candidates:
             candidate.effect.add(self.spec, candidate.place)
         self.model = self.spec.compile()
-        parameters = [on_all_parts(self.model, p) for p in plain.prior.space]
+        parameters = [on_bearing(self.model, on_all_parts(self.model, p)) for p in plain.prior.space]
         self.columns: dict[Candidate, list[int]] = {}
         for candidate in candidates:
-            added = [on_all_parts(self.model, p) for p in candidate.parameters(self.model)]
+            added = [on_bearing(self.model, on_all_parts(self.model, p)) for p in candidate.parameters(self.model)]
             self.columns[candidate] = list(range(len(parameters), len(parameters) + len(added)))
             parameters += added
         self.space = ParameterSpace(parameters)

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import mujoco
 import numpy as np
 
 from simopt_envs.physics.effects.effect import Motion, object_name
+from simopt_envs.physics.parameters import Parameter
 
 _LEAST_ROTOR = 0.1  # of the inertia along a joint that belongs to its motor, at least
 _LEAST_STAGE = 1e-3  # and to every joint behind it, so that the mass matrix is regular
+_BEARING = ".bearing"  # what the name of the tendon ends in that has what resists a link behind a transmission
+_RESISTS = {f"dof_{quantity}": f"tendon_{quantity}" for quantity in ("damping", "dampingpoly", "frictionloss")}
+_TENDON = mujoco.mjtObj.mjOBJ_TENDON
 _SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
 
@@ -116,14 +121,35 @@ def outermost_joints(model: mujoco.MjModel) -> tuple[str, ...]:
 def add_link_joint(spec: mujoco.MjSpec, joint: str, name: str) -> Any:
     """A joint on the axis of another, which is then the motor and its encoder; the link is where their sum is.
 
+    A joint's damping and friction are between its bodies, so that they go to the link: to a tendon ``NAME.bearing``,
+    whose length is that sum (:func:`on_bearing`). Its armature and its drives are the motor's.
+
     A motor without inertia would be thrown about by the smallest force between it and the link, so where the model
     gives it (almost) none, the new joint has some: it counts only while motor and link move against each other.
     """
     motor, total = spec.joint(joint), inertia(spec, joint)
     link = motor.parent.add_joint(blank(), name=name, type=motor.type, pos=motor.pos, axis=motor.axis)
+    bearing = spec.tendon(joint + _BEARING)
+    if bearing is None:
+        bearing = add_fixed_tendon(spec, joint + _BEARING, joint)
+        bearing.damping, motor.damping = np.array(motor.damping), np.zeros(len(motor.damping))
+        bearing.frictionloss, motor.frictionloss = motor.frictionloss, 0.0
+        bearing.solref_friction, bearing.solimp_friction = motor.solref_friction, motor.solimp_friction
+    bearing.wrap_joint(name, 1.0)
     link.armature = max(_LEAST_ROTOR * total - motor.armature, _LEAST_STAGE * total)
     if motor.type == mujoco.mjtJoint.mjJNT_SLIDE:
         # Without effect on a slide, except that MuJoCo no longer takes the mass matrix of its body for diagonal, as it
         # does for slides along its axes.
         link.pos = np.add(motor.pos, 1.0)
     return link
+
+
+def on_bearing(model: mujoco.MjModel, parameter: Parameter) -> Parameter:
+    """The parameter, where it writes damping or friction of a joint with a transmission, as it is the link's."""
+    writes = tuple(
+        replace(write, field=_RESISTS[write.field], object=f"{write.object}{_BEARING}")
+        if write.field in _RESISTS and mujoco.mj_name2id(model, _TENDON, f"{write.object}{_BEARING}") >= 0
+        else write
+        for write in parameter.writes
+    )
+    return replace(parameter, writes=writes)
