@@ -79,13 +79,15 @@ class Hypothesis:
         self.space = ParameterSpace(parameters)
         self.num_plain = len(plain.prior.space)
         nominal = self.space.to_unconstrained(self.space.nominal)
-        self._centre, self._unit = nominal.copy(), np.ones(len(nominal))
+        self._centre, self._unit, self._least = nominal.copy(), np.ones(len(nominal)), np.ones(len(nominal))
         self._centre[: self.num_plain] = plain.prior.mean
         self._unit[: self.num_plain] = plain.prior.std
         for candidate, columns in self.columns.items():
             z = np.array([self.space.to_unconstrained(self._probe(candidate, p)) for p in self._probes(candidate)])
-            size = np.abs(z - nominal).max(axis=0)[columns]
+            sizes = np.abs(z - nominal)[:, columns]
+            size, smallest = sizes.max(axis=0), np.where(sizes > 0, sizes, np.inf).min(axis=0)
             self._unit[columns] = np.where(size > 0, size, 1.0)
+            self._least[columns] = np.where(size > 0, smallest / self._unit[columns], 1.0)
             for i in set(columns) - set(self.amounts(candidate)):
                 if len(tried := np.unique(z[:, i])) > 1:
                     self._unit[i] = np.median(np.diff(tried))
@@ -176,14 +178,17 @@ class Hypothesis:
     def reach(self, u: Array) -> Array:
         """How far a difference of 1 goes along each coordinate at u (d,).
 
-        Of a shape, less far the more there is of its effect: to move the rest position of a spring of 50 probes by a
-        hundredth of the motion changes half as much as a probe does.
+        Of an amount, no farther than there is of it, but as far as the smallest probe: plays of 10 um and of 1 mm are
+        both looked for. Of a shape, less far the more there is of its effect: to move the rest position of a spring of
+        50 probes by a hundredth of the motion changes half as much as a probe does.
         """
         reach, neutral = np.ones(len(u)), self.neutral()
         for candidate, columns in self.columns.items():
             amounts = self.amounts(candidate)
             shape = [i for i in columns if i not in amounts]
-            reach[shape] = 1 / np.max(np.abs(u - neutral)[amounts], initial=1.0)
+            off = np.abs(u - neutral)[amounts]
+            reach[shape] = 1 / np.max(off, initial=1.0)
+            reach[amounts] = np.clip(off, self._least[amounts], 1.0)
         return reach
 
     def without(self, candidate: Candidate, u: Array) -> Array:
