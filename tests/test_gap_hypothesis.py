@@ -137,6 +137,25 @@ def test_a_large_effect_is_tried_at_about_its_size(arm):
     assert friction == pytest.approx(4.0, rel=0.2)
 
 
+def test_differences_in_an_amount_are_no_larger_than_it_or_its_smallest_probe(arm):
+    plain, _, motion = arm
+    loose = Candidate(EFFECTS["backlash"], "joint:elbow")
+    hypothesis = Hypothesis(plain, [loose], motion)
+    (play,) = hypothesis.columns[loose]
+    probes = np.sort(hypothesis.probes(loose)[:, play])
+    for amount, reach in (
+        (0.0, probes[0]),
+        (0.3 * probes[0], probes[0]),
+        (probes[1], probes[1]),
+        (9 * probes[-1], 1.0),
+    ):
+        u = hypothesis.neutral()
+        u[play] = amount
+        assert hypothesis.reach(u)[play] == pytest.approx(reach)
+        assert np.all(np.delete(hypothesis.reach(u), play) == 1.0)
+    assert probes[0] < 0.02 * probes[-1] == pytest.approx(0.02)
+
+
 def test_a_plain_parameter_goes_no_farther_than_its_prior_has_it_and_an_effect_is_free(arm):
     plain, _, motion = arm
     hypothesis = Hypothesis(plain, [Candidate(EFFECTS["viscous_friction"], "joint:elbow")], motion)

@@ -67,6 +67,17 @@ class Noise:
         """That of some windows, in the order given."""
         return Noise(self.scale, self.basis[rows], self.shrink[rows])
 
+    def replaced(self, rows: NDArray[np.bool_], other: Noise) -> Noise:
+        """This noise, but another of the same scale in some windows, (w,)."""
+        added = other.shrink.shape[1] - self.shrink.shape[1]  # directions; those that one has not take nothing out
+
+        def padded(values: Array, by: int) -> Array:
+            return np.concatenate([values, np.zeros((*values.shape[:-1], max(by, 0)))], axis=-1)
+
+        basis = np.where(rows[:, None, None], padded(other.basis, -added), padded(self.basis, added))
+        shrink = np.where(rows[:, None], padded(other.shrink, -added), padded(self.shrink, added))
+        return Noise(self.scale, basis, shrink)
+
     def whiten(self, errors: Array) -> Array:
         """Errors (n, w, S, c) -> independent ones of variance 1, (n, w, S, c)."""
         flat = (errors / self.scale).reshape(*errors.shape[:2], -1)

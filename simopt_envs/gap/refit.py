@@ -60,7 +60,7 @@ def fitted(refit: Refit, base: Base, windows: Windows, held_out: Windows, num_th
     """
     screened, hypothesis = refit.screened, refit.screened.hypothesis
     misfit, test = (Misfit(hypothesis, some, num_threads) for some in (windows, held_out))
-    misfit = misfit.with_noise(base.noise)
+    misfit, test = misfit.with_noise(base.noise), test.with_noise(base.held_out_noise)
     rows, of_base = base.worst(len(windows) / 2), range(len(base.fit.u))
 
     def on(some: NDArray[np.intp]) -> Misfit:
@@ -80,22 +80,14 @@ def fitted(refit: Refit, base: Base, windows: Windows, held_out: Windows, num_th
         near = best < len(starts)
         known = base.fit.jacobian if near else misfit.jacobian(coarse[best], of_base, DIFFERENCES[0])
         found = fit(misfit, coarse[best], ITERATIONS, known=known, differences=DIFFERENCES[1:])
-        told_in, foreseen = base.held_out_noise, base.held_out.jacobian
+        foreseen = base.held_out.jacobian
     else:
         others = [_coarsely(half, u, half.jacobian(u, of_base, DIFFERENCES[0])) for u in refit.others]
         start = misfit.best(np.array([refit.near, *others]))
-        own = misfit.with_noise(misfit.noise_at(start, base.noise.scale))
-        in_own = _surprise(own, start) < _surprise(misfit, start)
-        found = fit(own if in_own else misfit, start, ITERATIONS, differences=DIFFERENCES[1:])
-        told_in = test.noise_at(found.u, base.held_out_noise.scale) if in_own else base.held_out_noise
-        foreseen = None
-    told = HeldOut.of(test.with_noise(told_in), found.u, base.tolerance, foreseen)
+        found = fit(misfit.with_own_noise(start), start, ITERATIONS, differences=DIFFERENCES[1:])
+        test, foreseen = test.with_own_noise(found.u), None
+    told = HeldOut.of(test, found.u, base.tolerance, foreseen)
     return {**vars(found), **{f"held_out_{name}": array for name, array in vars(told).items()}}
-
-
-def _surprise(misfit: Misfit, u: Array) -> float:
-    """-log p(u | data) of u (d,), up to a constant that misfits in all noises share."""
-    return float(misfit.losses(u[None])[0]) + 0.5 * float(np.sum(misfit.noise.log_det))
 
 
 def _coarsely(misfit: Misfit, start: Array, known: Array) -> Array:
