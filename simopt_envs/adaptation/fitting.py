@@ -69,13 +69,13 @@ class Noise:
 
     def replaced(self, rows: NDArray[np.bool_], other: Noise) -> Noise:
         """This noise, but another of the same scale in some windows, (w,)."""
-        added = other.shrink.shape[1] - self.shrink.shape[1]  # directions; those that one has not take nothing out
+        width = max(noise.shrink.shape[1] for noise in (self, other))
 
-        def padded(values: Array, by: int) -> Array:
-            return np.concatenate([values, np.zeros((*values.shape[:-1], max(by, 0)))], axis=-1)
+        def widened(values: Array) -> Array:  # by directions in which nothing is taken out
+            return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, width - values.shape[-1])])
 
-        basis = np.where(rows[:, None, None], padded(other.basis, -added), padded(self.basis, added))
-        shrink = np.where(rows[:, None], padded(other.shrink, -added), padded(self.shrink, added))
+        basis = np.where(rows[:, None, None], widened(other.basis), widened(self.basis))
+        shrink = np.where(rows[:, None], widened(other.shrink), widened(self.shrink))
         return Noise(self.scale, basis, shrink)
 
     def whiten(self, errors: Array) -> Array:
