@@ -144,3 +144,14 @@ def test_a_channel_that_never_moves_is_no_trouble(model):
     posterior = LeastSquares(WindowMisfit(model, resting, PRIOR)).fit(np.random.default_rng(0))
     np.testing.assert_allclose(posterior.std, PRIOR.std, rtol=0.05)
     assert len(untold_combinations(PRIOR, posterior)) == 2
+
+
+def test_a_noise_of_some_windows_may_have_more_directions_than_that_of_others():
+    rng, scale = np.random.default_rng(0), np.array([0.5, 2.0])
+    few, many = (Noise.of(scale, rng.standard_normal((k, 3, 4, 2))) for k in (1, 3))
+    errors, rows = rng.standard_normal((2, 3, 4, 2)), np.array([True, False, True])
+    for one, other in ((few, many), (many, few)):
+        mixed = one.replaced(rows, other)
+        np.testing.assert_allclose(mixed.log_det, np.where(rows, other.log_det, one.log_det))
+        expected = np.where(rows[:, None, None], other.whiten(errors), one.whiten(errors))
+        np.testing.assert_allclose(mixed.whiten(errors), expected, atol=1e-12)
