@@ -54,7 +54,8 @@ def fitted(refit: Refit, base: Base, windows: Windows, held_out: Windows, num_th
     candidate is fitted at the size that it would need, too: with what speaks for it taken away, and with all plain
     parameters at their priors' means; derivatives by these are taken once, there. A base that an effect has bent is the
     end of a valley that leads away from the right one. A fit that goes on from another takes them all at each step, and
-    counts errors in its own noise: what uncertain starts leave depends on the model, as friction brings them to rest.
+    counts errors in its own noise where they are likelier in that: what uncertain starts leave depends on the model, as
+    friction brings them to rest.
 
     Starts are told apart by those windows alone of which the base leaves the most, then fitted to all.
     """
