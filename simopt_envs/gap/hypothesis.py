@@ -70,10 +70,10 @@ class Hypothesis:
         for candidate in candidates:
             candidate.effect.add(self.spec, candidate.place)
         self.model = self.spec.compile()
-        parameters = [on_bearing(self.model, on_all_parts(self.model, p)) for p in plain.prior.space]
+        parameters = [self._where_it_acts(p) for p in plain.prior.space]
         self.columns: dict[Candidate, list[int]] = {}
         for candidate in candidates:
-            added = [on_bearing(self.model, on_all_parts(self.model, p)) for p in candidate.parameters(self.model)]
+            added = [self._where_it_acts(p) for p in candidate.parameters(self.model)]
             self.columns[candidate] = list(range(len(parameters), len(parameters) + len(added)))
             parameters += added
         self.space = ParameterSpace(parameters)
@@ -96,6 +96,10 @@ class Hypothesis:
         self.low, self.high = (self.coordinates(bound) for bound in (self.space.low, self.space.high))
         within = np.where(np.arange(len(nominal)) < self.num_plain, FARTHEST, np.inf)
         self.low, self.high = np.maximum(self.low, -within), np.minimum(self.high, within)
+
+    def _where_it_acts(self, parameter: Parameter) -> Parameter:
+        """A parameter as it writes the model with the structure of the effects."""
+        return on_bearing(self.model, on_all_parts(self.model, parameter))
 
     def xi(self, u: Array) -> Array:
         """Coordinates (n, d) -> physical values, within the bounds."""
