@@ -26,6 +26,7 @@ from simopt_envs.gap.recordings import longer_windows, read_windows
 from simopt_envs.gap.result import Gap, judge, named_effects, repair
 from simopt_envs.gap.search import Progress, Search
 from simopt_envs.gap.separate import separate
+from simopt_envs.gap.sizes import of_best_length
 from simopt_envs.gap.trial import Base, Data
 from simopt_envs.gap.wild_starts import without_wild_starts
 from simopt_envs.measured.mapping import LogMapping
@@ -140,7 +141,10 @@ def solve(
     seen = tuple(c for effect in effects for c in _places(effect, plain.model) if _shows(c, plain.model, data.fitted))
     with _silent_warnings():
         search = Search(plain, data, problem.motion, seen, progress, engine, directory, problem.longer, null)
-        return _gap(problem, search.run())
+        found = search.run()
+        if judge(found) == "partly":
+            found = replace(found, final=of_best_length(found.final, found.data, problem.keyframe))
+        return _gap(problem, found)
 
 
 def _without_wild_starts(plain: Plain, data: Data, motion: Motion) -> Data:

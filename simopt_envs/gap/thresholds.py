@@ -22,7 +22,8 @@ windows were whole recordings or none, and a threshold more asked that starts ar
 """
 
 EVIDENCE = 20.0
-"""Nats that an effect must earn on the windows fitted and on those held out together."""
+"""Nats that an effect must earn on the windows fitted and on those held out together; on the latter alone, shorter
+windows for sizes to be theirs."""
 
 EVIDENCE_EACH = 5.0
 """Nats that it must earn on either, unless those on the windows held out are as many as are asked of both."""

@@ -74,7 +74,7 @@ def as_predicted(base: Base, longer: Data) -> Data | None:
     contacts slip, and a model that is far off gets lost on the way.
     """
     both = longer.fitted, longer.held_out
-    kept = [~_overlap(windows, longer.wild) for windows in both]
+    kept = [~overlap(windows, longer.wild) for windows in both]
     if base.excess >= LARGE or np.mean(np.concatenate(kept)) < LEAST_LEFT:
         return None
     for windows, rows in zip(both, kept, strict=True):
@@ -100,7 +100,7 @@ def _of_those(data: Data, fitted: NDArray[np.bool_], held_out: NDArray[np.bool_]
     return replace(data, fitted=few[0], held_out=few[1], warnings=(*data.warnings, warning), wild=tuple(wild))
 
 
-def _overlap(windows: Windows, stretches: Sequence[tuple[str, float, float]]) -> NDArray[np.bool_]:
+def overlap(windows: Windows, stretches: Sequence[tuple[str, float, float]]) -> NDArray[np.bool_]:
     """Which windows share time with any of some stretches of recordings, (w,)."""
     within = np.zeros(len(windows), dtype=bool)
     for name, begin, end in stretches:

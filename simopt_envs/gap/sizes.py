@@ -1,0 +1,73 @@
+"""The sizes of effects where no model is right: they are then of what a fit weighs, and that depends on the windows.
+
+Short windows weigh forces, as regressions on accelerations do, long ones the motion that these add up to. Where laws
+are of the right form that makes no difference, and long windows tell more.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from simopt_envs.gap.fit import DIFFERENCES, Fit, Misfit, fit
+from simopt_envs.gap.hypothesis import Hypothesis
+from simopt_envs.gap.predictive import HeldOut
+from simopt_envs.gap.refit import ITERATIONS
+from simopt_envs.gap.thresholds import EVIDENCE
+from simopt_envs.gap.trial import Base, Data
+from simopt_envs.gap.wild_starts import overlap
+from simopt_envs.measured.windows import Windows, cut_windows
+from simopt_envs.physics.effects.actuator_delay import LONGEST
+from simopt_envs.physics.parameters import Array
+
+_SHORTER = (0.2, 0.1)  # s
+_ROUNDS = 2  # fits, each in what the one before left
+
+
+def of_best_length(base: Base, data: Data, keyframe: str | None = None) -> Base:
+    """A base, or the same with the ξ that shorter windows give, if that predicts what was held out better.
+
+    By as many nats as are evidence for an effect.
+
+    Args:
+        base: fitted to the data.
+        data: in whose windows held out all are compared.
+        keyframe: where joints without a column start.
+    """
+    hypothesis = base.hypothesis
+    misfit = Misfit(hypothesis, data.fitted).with_noise(base.noise)
+    test = Misfit(hypothesis, data.held_out).with_noise(base.held_out_noise)
+    found = [base.fit.u]
+    for seconds in _SHORTER:
+        windows = _shorter(hypothesis, data, seconds, keyframe)
+        if windows is not None:
+            found.append(_fitted(base, windows))
+    left = 0.5 * np.sum(test.errors(np.array(found)) ** 2, axis=(1, 2, 3))
+    if left[0] - left.min() < EVIDENCE:
+        return base
+    u = found[int(np.argmin(left))]
+    there = Fit(u, misfit.errors(u[None])[0], misfit.jacobian(u), base.fit.prior_std, misfit.noise.log_det)
+    return replace(base, fit=there, held_out=HeldOut.of(test, u, base.tolerance))
+
+
+def _shorter(hypothesis: Hypothesis, data: Data, seconds: float, keyframe: str | None) -> Windows | None:
+    """The recordings that were fitted in shorter windows, without stretches that were left out; None if they are not.
+
+    A window must hold more samples than its start has numbers.
+    """
+    model, recordings = hypothesis.plain.model, data.fitted_recordings
+    if seconds >= data.seconds or seconds <= 2 * model.nv * float(data.fitted.offsets[1]):
+        return None
+    windows = cut_windows(model, recordings, seconds, keyframe=keyframe, history=2 * LONGEST, centred=True)
+    return windows.select(np.flatnonzero(~overlap(windows, data.wild)))
+
+
+def _fitted(base: Base, windows: Windows) -> Array:
+    """u (d,) fitted to some windows, errors counted in what is left of them."""
+    misfit, u = Misfit(base.hypothesis, windows), base.fit.u
+    for _ in range(_ROUNDS):
+        left = misfit.with_noise(misfit.noise_at(u, base.sensor_noise)).errors(u[None])[0]
+        scale = base.sensor_noise * np.maximum(1.0, np.sqrt(np.mean(left**2, axis=(0, 1))))
+        u = fit(misfit.with_noise(misfit.noise_at(u, scale)), u, ITERATIONS, differences=DIFFERENCES[1:]).u
+    return u

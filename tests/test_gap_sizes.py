@@ -1,0 +1,66 @@
+"""Sizes of effects by windows of other lengths."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+from conftest import needs_effects
+from gap_plant import MODEL, record
+
+from simopt_envs.gap import find, find_gap
+from simopt_envs.gap.fit import Misfit
+from simopt_envs.gap.hypothesis import Candidate
+from simopt_envs.gap.motion import motion_of
+from simopt_envs.gap.plain import plain_parameters
+from simopt_envs.gap.predictive import HeldOut
+from simopt_envs.gap.recordings import read_windows
+from simopt_envs.gap.search import Search
+from simopt_envs.gap.sizes import of_best_length
+from simopt_envs.physics.effects import EFFECTS
+
+pytestmark = needs_effects
+
+DRY = Candidate(EFFECTS["coulomb_friction"], "joint:elbow")
+FRICTION = 0.4  # N m
+
+
+def _friction(v, peak=0.0):
+    return np.array([0.0, -(FRICTION + peak * np.exp(-((v[1] / 0.2) ** 2))) * np.tanh(v[1] / 0.005)])
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    """The right law fitted, and the data."""
+    plain = plain_parameters(mujoco.MjSpec.from_string(MODEL))
+    recordings = record(lambda q, v: _friction(v), np.random.default_rng(0))
+    data = read_windows(plain.model, recordings)
+    return Search(plain, data, motion_of(plain.model, recordings), (DRY,)).base((DRY,)), data
+
+
+@pytest.mark.parametrize("wrong", [1.5, 1.0])
+def test_shorter_windows_tell_a_size_if_they_predict_what_was_held_out_better(fitted, wrong):
+    """A size that is 1.5 times too large is told anew; the right one stays."""
+    base, data = fitted
+    hypothesis, test = base.hypothesis, Misfit(base.hypothesis, data.held_out).with_noise(base.held_out_noise)
+    xi = hypothesis.xi(base.fit.u[None])[0]
+    xi[hypothesis.columns[DRY]] *= wrong
+    u = hypothesis.coordinates(xi)
+    given = replace(base, fit=replace(base.fit, u=u), held_out=HeldOut.of(test, u, base.tolerance))
+    found = of_best_length(given, data)
+    assert (found is given) == (wrong == 1.0)
+    (friction,) = hypothesis.values(DRY, hypothesis.xi(found.fit.u[None])[0]).values()
+    assert friction == pytest.approx(FRICTION, rel=0.05)
+    assert found.excess <= given.excess
+
+
+@pytest.mark.parametrize(("peak", "verdict", "times"), [(0.6, "partly", 1), (0.0, "named", 0)])
+def test_other_lengths_are_tried_where_no_model_is_right(monkeypatch, peak, verdict, times):
+    """A friction with a peak at rest, of which the library knows none here, and one without."""
+    tried = []
+    monkeypatch.setattr(find, "of_best_length", lambda base, *_: tried.append(base) or base)
+    recordings = record(lambda q, v: _friction(v, peak), np.random.default_rng(0))
+    gap = find_gap(mujoco.MjSpec.from_string(MODEL), recordings, effects=[DRY.effect])
+    assert (gap.verdict, len(tried)) == (verdict, times)
