@@ -14,14 +14,13 @@ from simopt_envs.gap.fit import DIFFERENCES, Fit, Misfit, fit
 from simopt_envs.gap.hypothesis import Hypothesis
 from simopt_envs.gap.predictive import HeldOut
 from simopt_envs.gap.refit import ITERATIONS
-from simopt_envs.gap.thresholds import EVIDENCE
+from simopt_envs.gap.thresholds import EVIDENCE, SHORTER_WINDOWS
 from simopt_envs.gap.trial import Base, Data
 from simopt_envs.gap.wild_starts import overlap
 from simopt_envs.measured.windows import Windows, cut_windows
 from simopt_envs.physics.effects.actuator_delay import LONGEST
 from simopt_envs.physics.parameters import Array
 
-_SHORTER = (0.2, 0.1)  # s
 _ROUNDS = 2  # fits, each in what the one before left
 
 
@@ -39,7 +38,7 @@ def of_best_length(base: Base, data: Data, keyframe: str | None = None) -> Base:
     misfit = Misfit(hypothesis, data.fitted).with_noise(base.noise)
     test = Misfit(hypothesis, data.held_out).with_noise(base.held_out_noise)
     found = [base.fit.u]
-    for seconds in _SHORTER:
+    for seconds in SHORTER_WINDOWS:
         windows = _shorter(hypothesis, data, seconds, keyframe)
         if windows is not None:
             found.append(_fitted(base, windows))

@@ -96,6 +96,10 @@ OUTLYING = 5.0
 """Times what a candidate leaves of the median window, from which what it leaves of such a window, or the start may make
 of it, has it left out, too: where the model as given leaves ``LARGE`` times as much as that, it could not tell."""
 
+SHORTER_WINDOWS = (0.2, 0.1)
+"""Seconds of the windows by which sizes are told too, where no model is right. New since 62c9aa6, and set with EMPS and
+its published values in sight: windows of 0.05 to 3.5 s had been tried on it."""
+
 LONG_WINDOW = 4.0
 """Seconds of a window at most, where the model is near enough to the data for whole recordings to be predicted."""
 
