@@ -239,11 +239,16 @@ def settings(gap: Gap) -> Section:
         "fitted": f"{len(fitted)} windows of {', '.join(r.name for r in gap.data.fitted_recordings)}",
         "held out": f"{len(held_out)} windows of {', '.join(r.name for r in gap.data.held_out_recordings)}",
         "window": f"{gap.data.seconds:g} s, {len(fitted.offsets)} samples of {len(fitted.channels)} channels",
-        **{name: f"{getattr(thresholds, name):g}" for name in sorted(vars(thresholds)) if name.isupper()},
+        **{name: _numbers(getattr(thresholds, name)) for name in sorted(vars(thresholds)) if name.isupper()},
         "time": f"{gap.seconds:.0f} s",
         **installed_versions(),
     }
     return table("How it was made", ("", ""), list(used.items()))
+
+
+def _numbers(values: float | Sequence[float]) -> str:
+    """A setting, or the several of one, as it is printed."""
+    return ", ".join(f"{value:g}" for value in np.ravel(values))
 
 
 def _ahead(behind: float) -> str:
