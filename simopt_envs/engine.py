@@ -1,4 +1,4 @@
-"""Where embarrassingly parallel work is done: in this process, or as tasks of Ray on any number of machines.
+"""Where embarrassingly parallel work is done: in this process, its threads, or as tasks of Ray on many machines.
 
 Simulated rollouts of many ξ, candidate fits, cells of an experiment: each is a list of tasks for one function. An
 :class:`Engine` maps the function over the tasks, and the results are the same whichever engine does it.
@@ -6,10 +6,14 @@ Simulated rollouts of many ξ, candidate fits, cells of an experiment: each is a
 
 from __future__ import annotations
 
+import itertools
 import os
 import socket
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from queue import SimpleQueue
 from textwrap import shorten
+from threading import Thread
 from typing import Any, Protocol, TypeVar
 from urllib.parse import urlsplit
 
@@ -70,6 +74,13 @@ class Engine(Protocol):
         ...
 
 
+def counted(progress: OnProgress, number: int, done: int = 0) -> OnOutcome:
+    """Tells how many of a number of tasks are done, now and as each of those left to an engine ends."""
+    progress(done, number)
+    ended = itertools.count(done + 1)
+    return lambda *_: progress(next(ended), number)
+
+
 class LocalEngine:
     """Does one task after the other in this process; each may use all cores.
 
@@ -92,6 +103,46 @@ class LocalEngine:
         """See :meth:`Engine.map`."""
         outcomes = ((i, _attempt(function, task, *shared)) for i, task in enumerate(tasks))
         return _collect(outcomes, tasks, self._on_progress, on_outcome)
+
+
+class ThreadEngine:
+    """Does as many tasks at once as there are cores, each in a thread of this process.
+
+    It pays where tasks simulate much and in small batches: what one does in Python, others simulate meanwhile.
+
+    Args:
+        on_progress: called after each task.
+    """
+
+    num_threads = 1
+
+    def __init__(self, on_progress: OnProgress | None = None):
+        self._on_progress = on_progress
+
+    def map(
+        self,
+        function: Callable[..., R],
+        tasks: Sequence[T],
+        shared: tuple[object, ...] = (),
+        on_outcome: OnOutcome | None = None,
+    ) -> list[R]:
+        """See :meth:`Engine.map`."""
+        left, ended = deque(enumerate(tasks)), SimpleQueue[tuple[int, R | Exception]]()
+
+        def work() -> None:
+            while left:
+                try:
+                    i, task = left.popleft()
+                except IndexError:  # another thread has taken the last one
+                    return
+                ended.put((i, _attempt(function, task, *shared)))
+
+        for _ in range(min(os.cpu_count() or 1, len(tasks))):
+            Thread(target=work, daemon=True).start()  # one that is no daemon would keep Ctrl-C waiting for its task
+        try:
+            return _collect((ended.get() for _ in tasks), tasks, self._on_progress, on_outcome)
+        finally:
+            left.clear()
 
 
 class RayEngine:

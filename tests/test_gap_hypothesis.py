@@ -10,16 +10,17 @@ import pytest
 from conftest import needs_effects
 from gap_plant import MODEL, record
 
+from simopt_envs.distributions import Gaussian
 from simopt_envs.gap.fit import Misfit
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
 from simopt_envs.gap.large import of_some_size
 from simopt_envs.gap.motion import motion_of
-from simopt_envs.gap.plain import plain_parameters
+from simopt_envs.gap.plain import Plain, plain_parameters
 from simopt_envs.gap.recordings import read_windows
 from simopt_envs.gap.thresholds import FARTHEST
 from simopt_envs.measured import Recording, cut_windows
 from simopt_envs.physics.effects import EFFECTS
-from simopt_envs.physics.parameters import ParameterSpace
+from simopt_envs.physics.parameters import Parameter, ParameterSpace, Write
 from simopt_envs.physics.writer import ModelWriter
 
 pytestmark = needs_effects
@@ -48,6 +49,23 @@ _MASS = """
 </mujoco>
 """
 _SOFT = ("backlash", "load_dependent_friction")
+
+
+_SCENERY = """
+<mujoco>
+  <worldbody>
+    <site name="eye" pos="0 0 2" zaxis="0 0 -1"/>
+    <body name="lump" pos="0 0 0.5">
+      <freejoint/>
+      <geom name="core" size="0.05"/>
+      <geom name="shell" type="box" size="0.2 0.1 0.05" pos="0.1 0 0" euler="10 20 30" contype="0" conaffinity="0"/>
+    </body>
+    <geom name="floor" type="plane" size="1 1 0.1"/>
+    <geom name="picture" size="0.1" pos="0 0 1" contype="0" conaffinity="0"/>
+  </worldbody>
+  {}
+</mujoco>
+"""
 
 
 @pytest.fixture(scope="module")
@@ -235,3 +253,26 @@ def test_a_cogging_of_negative_amplitude_is_the_same_as_people_write_it(arm):
     np.testing.assert_array_equal(hypothesis.usual(usual), usual)
     given, written = hypothesis.simulator(data.fitted)(hypothesis.xi(np.array([u, usual])))
     np.testing.assert_allclose(given, written, atol=1e-9)
+
+
+def _simulated(model):
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, 300)  # it falls, and tumbles on the floor
+    return data.qpos
+
+
+def test_what_is_only_seen_is_not_simulated_and_nothing_moves_otherwise():
+    spec = mujoco.MjSpec.from_string(_SCENERY.format(""))
+    plain = plain_parameters(spec)
+    lean = plain.compiled(spec)
+    assert [lean.geom(i).name for i in range(lean.ngeom)] == ["floor", "core"]
+    np.testing.assert_array_equal(_simulated(lean), _simulated(spec.compile()))
+    assert spec.geom("shell") is not None  # the repaired model has it
+
+
+def test_what_is_only_seen_stays_where_it_matters():
+    spec = mujoco.MjSpec.from_string(_SCENERY.format(""))
+    size = Parameter("shell", "1", 1.0, 0.5, 2.0, "log", (Write("geom_size", "shell", (0,), "scale"),))
+    assert Plain.of(spec, Gaussian.around_nominal(ParameterSpace([size]), [0.1])).compiled(spec).ngeom == 4
+    spec = mujoco.MjSpec.from_string(_SCENERY.format('<sensor><rangefinder name="eye" site="eye"/></sensor>'))
+    assert plain_parameters(spec).compiled(spec).ngeom == 4

@@ -23,7 +23,7 @@ from toy_reach import SPACE, PushPolicy, ReachEnv
 
 from baselines.cli import main
 from simopt_envs.adaptation import EnvSimulator, HiddenSystem, ReplaySimulator, window_trajectories
-from simopt_envs.engine import FailedTasksError, LocalEngine, RayEngine
+from simopt_envs.engine import FailedTasksError, LocalEngine, RayEngine, ThreadEngine
 from simopt_envs.gap import find_gap
 from simopt_envs.physics.effects import EFFECTS
 
@@ -61,14 +61,14 @@ def forever(task):
     time.sleep(600)
 
 
-def test_results_in_order_and_progress_from_both_engines():
+def test_results_in_order_and_progress_from_all_engines():
     shared = (np.arange(1000.0), "x")
-    for make, workers in ((LocalEngine, 1), (RayEngine, 2)):
+    for make, workers in ((LocalEngine, 1), (ThreadEngine, 1), (RayEngine, 2)):
         seen = []
         results = make(on_progress=lambda *counts: seen.append(counts)).map(weighted, range(20), shared)  # noqa: B023
         assert [value for value, _ in results] == [task * 499500.0 for task in range(20)]
         assert len({pid for _, pid in results} - {os.getpid()}) <= workers
-        assert (os.getpid() in {pid for _, pid in results}) is (make is LocalEngine)
+        assert (os.getpid() in {pid for _, pid in results}) is (make is not RayEngine)
         assert seen == [(done, 20) for done in range(1, 21)]
 
 
@@ -80,7 +80,7 @@ def test_a_killed_worker_changes_nothing(tmp_path):
     np.testing.assert_array_equal(results, undisturbed)
 
 
-@pytest.mark.parametrize("make", [LocalEngine, RayEngine])
+@pytest.mark.parametrize("make", [LocalEngine, ThreadEngine, RayEngine])
 def test_failures_are_told_and_the_rest_is_kept(make):
     with pytest.raises(
         FailedTasksError, match="2 of 6 tasks failed, the first of them number 1, 1: ValueError: 1 is not"
@@ -119,7 +119,8 @@ def test_an_address_where_nothing_answers_is_told_at_once(monkeypatch):
         RayEngine(address)
 
 
-def test_ctrl_c_cancels_what_is_left():
+@pytest.mark.parametrize("make", [ThreadEngine, RayEngine])
+def test_ctrl_c_cancels_what_is_left(make):
     def interrupt(*_):
         raise KeyboardInterrupt
 
@@ -127,11 +128,11 @@ def test_ctrl_c_cancels_what_is_left():
     signal.alarm(2)
     try:
         with pytest.raises(KeyboardInterrupt):
-            RayEngine().map(forever, range(2))
+            make().map(forever, range(2))
     finally:
         signal.alarm(0)
         signal.signal(signal.SIGALRM, previous)
-    assert RayEngine().map(some_fail, [0, 2]) == [0, 2]  # the workers are free again
+    assert make().map(some_fail, [0, 2]) == [0, 2]  # the workers are free again
 
 
 class CrashingEnv(ReachEnv):
@@ -236,7 +237,7 @@ def recordings():
 @needs_effects
 def test_candidates_are_fitted_the_same_bit_by_bit(recordings):
     found, told = [], []
-    for engine in (LocalEngine(), RayEngine()):
+    for engine in (LocalEngine(), ThreadEngine(), RayEngine()):
         told.append([])
         gap = find_gap(
             mujoco.MjSpec.from_string(MODEL),
@@ -246,19 +247,20 @@ def test_candidates_are_fitted_the_same_bit_by_bit(recordings):
             progress=lambda *now, log=told[-1]: log.append(now),
         )
         found.append(gap)
-    local, remote = found
-    assert told[0] == told[1]
+    local = found[0]
+    assert told[0] == told[1] == told[2]
     assert {("refit", done, 3) for done in range(4)} <= {*told[0]}  # the three that come nearest at some size
     assert local.effects[0].candidate.place == "joint:elbow"
-    for one, other in zip(local.explanation.stages, remote.explanation.stages, strict=True):
-        assert [str(score.candidate) for score in one.scores] == [str(score.candidate) for score in other.scores]
-        for mine, its in zip(one.scores, other.scores, strict=True):
-            np.testing.assert_array_equal(mine.trial.fit.u, its.trial.fit.u)
-            np.testing.assert_array_equal(mine.trial.fit.jacobian, its.trial.fit.jacobian)
-            np.testing.assert_array_equal(mine.trial.held_out.errors, its.trial.held_out.errors)
-            np.testing.assert_array_equal(mine.trial.held_out.jacobian, its.trial.held_out.jacobian)
-    assert local.to_dict() | {"seconds": 0} == remote.to_dict() | {"seconds": 0}
-    assert local.spec.to_xml() == remote.spec.to_xml()
+    for gap in found[1:]:
+        for one, other in zip(local.explanation.stages, gap.explanation.stages, strict=True):
+            assert [str(score.candidate) for score in one.scores] == [str(score.candidate) for score in other.scores]
+            for mine, its in zip(one.scores, other.scores, strict=True):
+                np.testing.assert_array_equal(mine.trial.fit.u, its.trial.fit.u)
+                np.testing.assert_array_equal(mine.trial.fit.jacobian, its.trial.fit.jacobian)
+                np.testing.assert_array_equal(mine.trial.held_out.errors, its.trial.held_out.errors)
+                np.testing.assert_array_equal(mine.trial.held_out.jacobian, its.trial.held_out.jacobian)
+        assert local.to_dict() | {"seconds": 0} == gap.to_dict() | {"seconds": 0}
+        assert local.spec.to_xml() == gap.spec.to_xml()
 
 
 @needs_effects

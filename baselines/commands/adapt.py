@@ -24,6 +24,7 @@ from simopt_envs.adaptation.checkpoint import write_json
 from simopt_envs.adaptation.fitting import CMAES, LeastSquares, WindowMisfit, untold_combinations
 from simopt_envs.adaptation.updates import Update
 from simopt_envs.distributions import Gaussian
+from simopt_envs.engine import ThreadEngine
 from simopt_envs.physics import ModelWriter
 from simopt_envs.physics.effects import require_mujoco
 from simopt_envs.report import Details, Run
@@ -171,7 +172,8 @@ class Adapt:
         else:
             display.say("looking for what p(ξ) cannot explain")
             try:
-                explained = explain(self.system, distributions, logs, folder, display.console, self.where.make())
+                engine = self.where.make(local=ThreadEngine)
+                explained = explain(self.system, distributions, logs, folder, display.console, engine)
             except ValueError as error:
                 finding = f"What p(ξ) cannot explain could not be looked for: {error}"
             else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -22,8 +23,12 @@ class EngineOptions:
         if self.ray_address is not None and self.engine != "ray":
             raise ValueError(f"--ray-address {self.ray_address} needs --engine ray")
 
-    def make(self, on_progress: OnProgress | None = None) -> Engine:
+    def make(self, on_progress: OnProgress | None = None, local: Callable[..., Engine] = LocalEngine) -> Engine:
         """The engine.
+
+        Args:
+            on_progress: called after each task.
+            local: makes that of this machine's cores.
 
         Raises:
             ConnectionError: where no cluster answers at the address.
@@ -31,4 +36,4 @@ class EngineOptions:
         """
         if self.engine == "ray":
             return RayEngine(self.ray_address, on_progress)
-        return LocalEngine(on_progress)
+        return local(on_progress)

@@ -24,7 +24,7 @@ from baselines.commands.parameter_file import read_parameters
 from baselines.commands.progress import SECONDS_BETWEEN_LINES
 from baselines.commands.recordings import existing_logs
 from simopt_envs.distributions import Gaussian
-from simopt_envs.engine import Engine
+from simopt_envs.engine import Engine, ThreadEngine
 from simopt_envs.measured import load_recording
 from simopt_envs.physics import Parameter, ParameterSpace
 from simopt_envs.physics.spec_writer import write_spec
@@ -73,7 +73,7 @@ class Gap:
             keyframe = keyframe or _HOME
         if self.config is not None:
             plain = read_parameters(self.config)
-        engine, console = self.where.make(), Console(highlight=False)
+        engine, console = self.where.make(local=ThreadEngine), Console(highlight=False)
         with _shown(console) as show:
             gap = find_gap(
                 model,
@@ -111,7 +111,7 @@ def explain(
         folder: for ``gap.json``, ``report.html`` and the repaired model, if more than noise is left. What is there
             already is kept, and a search that was stopped goes on from its finished fits.
         console: shows the progress.
-        engine: fits the candidates; this process by default.
+        engine: fits the candidates; threads of this process by default.
 
     Returns:
         Whether noise is all that is left.

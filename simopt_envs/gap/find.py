@@ -85,7 +85,7 @@ def find_gap(
         keyframe: where joints without a column start.
         effects: the library to search.
         progress: is told of what is being done.
-        engine: fits the candidates; this process by default. The result does not depend on it.
+        engine: fits the candidates; threads of this process by default. The result does not depend on it.
         directory: keeps finished fits, from which a call with the same arguments goes on; None for none.
 
     Raises:

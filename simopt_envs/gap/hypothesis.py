@@ -69,7 +69,7 @@ class Hypothesis:
         self.spec = plain.spec.copy()
         for candidate in candidates:
             candidate.effect.add(self.spec, candidate.place)
-        self.model = self.spec.compile()
+        self.model = plain.compiled(self.spec)
         parameters = [self._where_it_acts(p) for p in plain.prior.space]
         self.columns: dict[Candidate, list[int]] = {}
         for candidate in candidates:
@@ -96,6 +96,9 @@ class Hypothesis:
         self.low, self.high = (self.coordinates(bound) for bound in (self.space.low, self.space.high))
         within = np.where(np.arange(len(nominal)) < self.num_plain, FARTHEST, np.inf)
         self.low, self.high = np.maximum(self.low, -within), np.minimum(self.high, within)
+
+    def __repr__(self) -> str:
+        return " and ".join(map(str, self.candidates)) or "plain parameters alone"
 
     def _where_it_acts(self, parameter: Parameter) -> Parameter:
         """A parameter as it writes the model with the structure of the effects."""

@@ -23,18 +23,16 @@ _FINER = np.geomspace([0.4, 0.9], [2.5, 1.1], 9).T  # of the best so far: where 
 
 
 def nearest_size(
-    hypothesis: Hypothesis,
-    candidate: Candidate,
-    windows: Windows,
-    noise: Noise,
-    base: Array,
-    rough: Array | None = None,
+    tried: tuple[Hypothesis, Array | None], windows: Windows, noise: Noise, base: Array, num_threads: int
 ) -> tuple[float, Array]:
-    """How far a candidate is from some windows at the size that comes nearest, or nearest around a rough one (d,).
+    """How far a hypothesis is from some windows at the size of its last candidate that comes nearest.
 
-    That is -log p, and the coordinates; those of the base (k,) stay.
+    That is -log p, and the coordinates; those of the base (k,) stay. Sizes are tried all over, or around a rough one,
+    (d,), that comes with the hypothesis.
     """
-    misfit = Misfit(hypothesis, windows).with_noise(noise)
+    hypothesis, rough = tried
+    candidate = hypothesis.candidates[-1]
+    misfit = Misfit(hypothesis, windows, num_threads).with_noise(noise)
     start = np.concatenate([base, hypothesis.neutral()[len(base) :]])
     if rough is None:
         found = of_rough_size(misfit, candidate, start)

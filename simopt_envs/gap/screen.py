@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from simopt_envs.engine import Engine, counted
 from simopt_envs.gap.fit import Misfit
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
 from simopt_envs.gap.trial import Base
@@ -38,7 +39,7 @@ class Screened:
 
 
 def screen(
-    base: Base, candidates: Sequence[Candidate], windows: Windows, progress: Callable[[int, int], None]
+    base: Base, candidates: Sequence[Candidate], windows: Windows, engine: Engine, progress: Callable[[int, int], None]
 ) -> list[Screened]:
     """The candidates that a base lacks, largest expected gain less the price of their parameters (BIC) first.
 
@@ -48,31 +49,42 @@ def screen(
         base: what they are added to.
         candidates: some of which the base may have.
         windows: that the base was fitted to.
+        engine: screens them.
         progress: is told how many of how many are done.
     """
-    lacking = [c for c in candidates if c not in base.hypothesis.candidates]
+    plain, effects, motion = base.hypothesis.plain, base.hypothesis.candidates, base.hypothesis.motion
+    lacking = [c for c in candidates if c not in effects]
+    hypotheses = [Hypothesis(plain, [*effects, c], motion) for c in lacking]
+    shared = base, windows, engine.num_threads
+    made = engine.map(_made_by_probes, hypotheses, shared, counted(progress, len(lacking)))
+    found = [_screened(*one, base) for one in zip(hypotheses, made, strict=True)]
     price = 0.5 * np.log(base.fit.errors.size)
-    found = []
-    for done, candidate in enumerate(lacking):
-        progress(done, len(lacking))
-        found.append(_screen_one(base, candidate, windows))
     return sorted(found, key=lambda s: price * len(s.hypothesis.columns[s.candidate]) - s.gain)
 
 
-def _screen_one(base: Base, candidate: Candidate, windows: Windows) -> Screened:
-    """What a candidate would gain if its best probe acted linearly."""
-    plain, motion = base.hypothesis.plain, base.hypothesis.motion
-    hypothesis = Hypothesis(plain, [*base.hypothesis.candidates, candidate], motion)
-    misfit = Misfit(hypothesis, windows).with_noise(base.noise)
-    amounts, neutral = hypothesis.amounts(candidate), hypothesis.neutral()
-    probes = hypothesis.probes(candidate)
+def _made_by_probes(hypothesis: Hypothesis, base: Base, windows: Windows, num_threads: int) -> Array:
+    """What each probe of a hypothesis' last candidate changes in a base's errors, (n, w, S, c)."""
+    without = hypothesis.neutral()
+    without[: len(base.fit.u)] = base.fit.u
+    tried = np.concatenate([without[None], _probes(hypothesis, base)])  # a structure alone changes a little
+    errors = Misfit(hypothesis, windows, num_threads).with_noise(base.noise).errors(tried)
+    return errors[1:] - errors[0]
+
+
+def _probes(hypothesis: Hypothesis, base: Base) -> Array:
+    """Those of its last candidate, on a base, (n, d)."""
+    probes = hypothesis.probes(hypothesis.candidates[-1])
     probes[:, : len(base.fit.u)] = base.fit.u
+    return probes
+
+
+def _screened(hypothesis: Hypothesis, made: Array, base: Base) -> Screened:
+    """What a hypothesis' last candidate would gain if its best probe acted linearly."""
+    candidate = hypothesis.candidates[-1]
+    amounts, neutral = hypothesis.amounts(candidate), hypothesis.neutral()
     residual, (orthonormal, triangle) = base.fit.residual, base.fit.orthonormal
     found: list[Screened] = []
-    without = neutral.copy()
-    without[: len(base.fit.u)] = base.fit.u
-    errors = misfit.errors(np.concatenate([without[None], probes]))  # a structure alone changes a little
-    for probe, change_of_data in zip(probes, errors[1:] - errors[0], strict=True):
+    for probe, change_of_data in zip(_probes(hypothesis, base), made, strict=True):
         change = np.concatenate([change_of_data.ravel(), np.zeros(len(base.fit.u))])
         absorbed = orthonormal.T @ change
         direction = change - orthonormal @ absorbed

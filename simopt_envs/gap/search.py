@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import fields, replace
 from functools import partial
@@ -12,7 +11,7 @@ import numpy as np
 
 from simopt_envs.adaptation.checkpoint import Result
 from simopt_envs.adaptation.fitting import Noise
-from simopt_envs.engine import Engine, LocalEngine
+from simopt_envs.engine import Engine, ThreadEngine, counted
 from simopt_envs.gap.explanation import Explanation, Stage, ranked, stage_of
 from simopt_envs.gap.fit import DIFFERENCES, Fit, Misfit, fit
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
@@ -55,7 +54,7 @@ class Search:
         motion: of the recordings.
         candidates: what may be missing.
         progress: is told of it.
-        engine: fits the candidates; this process by default.
+        engine: tries and fits the candidates; threads of this process by default.
         directory: keeps finished fits, from which a search of the same goes on; None for none.
         longer: the recordings in longer windows, the longest first; the first in which the model is near are fitted.
         null: what :meth:`base` gives without effects, if it is there already.
@@ -74,7 +73,7 @@ class Search:
         null: Base | None = None,
     ):
         self.plain, self.data, self.motion, self.candidates = plain, data, motion, tuple(candidates)
-        self._longer, self._progress, self._engine = tuple(longer), progress, engine or LocalEngine()
+        self._longer, self._progress, self._engine = tuple(longer), progress, engine or ThreadEngine()
         self._kept = kept_fits(directory, plain, motion, data.fitted, data.held_out)
         self._null = null
         self._floor: Array | None = None if null is None else null.sensor_noise
@@ -202,7 +201,7 @@ class Search:
     def _screened(self, base: Base, candidates: Sequence[Candidate] | None = None) -> list[Screened]:
         """All candidates, or some, as they would act on a base."""
         screened = self.candidates if candidates is None else candidates
-        return screen(base, screened, self.data.fitted, partial(self._progress, "screen"))
+        return screen(base, screened, self.data.fitted, self._engine, partial(self._progress, "screen"))
 
     def _polished(self, stage: Stage) -> Stage:
         """A stage from the base fitted from where candidates led its parameters, if it comes out better there.
@@ -255,14 +254,14 @@ class Search:
         if effects not in self._largest:
             rows = base.worst(SECONDS / self.data.seconds)
             windows, noise = self.data.fitted.select(rows), base.noise.select(rows)
-            start, nearest = afresh(base), []
+            shared = windows, noise, afresh(base), self._engine.num_threads
             lacking = [c for c in self.candidates if c not in effects]
-            hypotheses = [Hypothesis(self.plain, (*effects, c), self.motion) for c in lacking]
-            for done, one in enumerate(zip(hypotheses, lacking, strict=True)):
-                self._progress("try sizes of", done, len(lacking))
-                nearest.append(nearest_size(*one, windows, noise, start))
+            roughly = [(Hypothesis(self.plain, (*effects, c), self.motion), None) for c in lacking]
+            note = counted(partial(self._progress, "try sizes of"), len(lacking))
+            nearest = self._engine.map(nearest_size, roughly, shared, note)
             order = np.argsort([loss for loss, _ in nearest], kind="stable")[: _TRIED_FINELY * LARGE_REFITTED]
-            fine = [nearest_size(hypotheses[i], lacking[i], windows, noise, start, nearest[i][1])[0] for i in order]
+            finely = [(roughly[i][0], nearest[i][1]) for i in order]
+            fine = [loss for loss, _ in self._engine.map(nearest_size, finely, shared)]
             ordered = [lacking[order[i]] for i in np.argsort(fine, kind="stable")]
             self._largest[effects] = of_several_effects(ordered)
         return self._largest[effects]
@@ -296,13 +295,12 @@ class Search:
         """Candidates fitted, each together with all that the base has."""
         keys = [self._key(r.screened.hypothesis, base.noise, base.fit.u, *r.starts) for r in refits]
         todo = [i for i, key in enumerate(keys) if not self._kept.has(key)]
-        done = itertools.count(len(refits) - len(todo) + 1)
-        self._progress("refit", len(refits) - len(todo), len(refits))
+        tell = counted(partial(self._progress, "refit"), len(refits), len(refits) - len(todo))
 
         def note(number: int, outcome: Result | Exception) -> None:
             if not isinstance(outcome, Exception):
                 self._kept.phase(keys[todo[number]], lambda: outcome)
-            self._progress("refit", next(done), len(refits))
+            tell(number, outcome)
 
         shared = base, self.data.fitted, self.data.held_out, self._engine.num_threads
         found = dict(zip(todo, self._engine.map(fitted, [refits[i] for i in todo], shared, note), strict=True))
