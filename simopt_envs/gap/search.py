@@ -125,7 +125,7 @@ class Search:
         """
         look = None
         if base.excess >= LARGE:
-            look = self._without_wild(self._look(base))
+            look = self._look(base)
             if look is None:
                 return self.stage(self.base())
             base = look.base
@@ -171,10 +171,17 @@ class Search:
         self._tolerance = tolerance_of(best)
         return self.base(effects, usual(best.fit.u)) if np.any(self._tolerance > 1) else base
 
-    def _look(self, base: Base) -> Stage:
-        """A stage of those candidates alone that come nearest to the data at some size."""
+    def _look(self, base: Base) -> Stage | None:
+        """A stage of those candidates alone that come nearest to the data at some size.
+
+        None where they tell of windows whose start decides, which fits with the base's derivatives may do already.
+        """
         screened = self._screened(base, self._large(base))
-        return ranked(base, screened, self._in_full(base, screened, self.trials(base, self._refits(base, screened))))
+        halfway = self._without_wild(ranked(base, screened, self.trials(base, self._refits(base, screened))))
+        if halfway is None:
+            return None
+        base = halfway.base
+        return self._without_wild(ranked(base, screened, self._in_full(base, screened, halfway.trials)))
 
     def stage(self, base: Base, look: Stage | None = None, before: Stage | None = None) -> Stage:
         """Screen all candidates, and fit the best, but those that a look from the same base has fitted.
