@@ -5,12 +5,15 @@ ROBOTICS := .venv-robotics/installed
 
 .PHONY: demo test test-slow lint venv venv-robotics experiments experiments-quick hidden-effects hidden-effects-quick clean
 
+# Files of tests side by side: the longest are those of the gap workflow, which need a core each.
+AT_ONCE := --numprocesses 2 --dist loadfile
+
 demo: $(VENV)
 	.venv/bin/simopt-envs demo --task drawer --out out/demo
 
 test: $(VENV) $(ROBOTICS)
-	.venv/bin/python -m pytest
-	.venv-robotics/bin/python -m pytest
+	.venv/bin/python -m pytest $(AT_ONCE)
+	.venv-robotics/bin/python -m pytest $(AT_ONCE)
 
 test-slow: $(VENV)
 	.venv/bin/python -m pytest -m slow

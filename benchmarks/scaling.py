@@ -1,6 +1,7 @@
-"""How far one machine's cores, a cluster's or a GPU carry the simulated rollouts of an update.
+"""How far one machine's cores, a cluster's or a GPU carry the simulated rollouts of an update, and a gap search.
 
     python benchmarks/scaling.py ray                          # 9600 rollouts by Ray against the default, same cores
+    python benchmarks/scaling.py gap --model MODEL --data RECORDINGS...  # a search by threads and Ray, same cores
     python benchmarks/scaling.py warp --device cuda:0         # control steps/s, drawer and swing-peg, a ξ per world
     python benchmarks/scaling.py iteration --device cuda:0    # a SimOpt iteration, 9600 worlds at once
 
@@ -28,7 +29,8 @@ import simopt_envs  # noqa: F401 - registers the environments
 from baselines.commands.inputs import distribution
 from baselines.ppo_torch import PPOConfig, TorchPolicy, TorchPPO
 from simopt_envs.adaptation import REPS, Discrepancy, EnvSimulator, HiddenSystem, Rollouts, SimOpt
-from simopt_envs.engine import Engine, LocalEngine, RayEngine
+from simopt_envs.engine import Engine, LocalEngine, RayEngine, ThreadEngine
+from simopt_envs.gap import find_gap
 
 DRAWER, SWING_PEG = "SimOpt/Drawer-v0", "SimOpt/SwingPeg-v0"
 HIDDEN = {"cabinet_x": 0.15}
@@ -100,6 +102,28 @@ class Ray:
         print(f"\nbytes per rollout: {xi[0].nbytes + 88} to a worker, {len(received) / n:.0f} back;", end=" ")
         print(f"{len(pickle.dumps(policy))} for the policy, once per worker")
         print("the driver's own: " + ", ".join(f"{what} {1e3 * best:.0f} ms" for what, best in serial.items()))
+
+
+@dataclass
+class Gap:
+    """A gap search by threads, the default, and by Ray, against one candidate after the other on the same cores."""
+
+    model: Path
+    """MJCF."""
+    data: tuple[Path, ...]
+    """Recordings, two at least."""
+
+    def run(self) -> None:
+        """Measure and print."""
+        seconds, found = {}, []
+        for engine in (LocalEngine(), ThreadEngine(), RayEngine()):
+            gap = find_gap(self.model, self.data, engine=engine)
+            seconds[type(engine).__name__] = gap.seconds
+            found.append(gap.to_dict() | {"seconds": 0.0})
+        print(f"{gap}\n{os.cpu_count()} cores\n\n| | seconds | ÷ one after the other |\n|---|---|---|")
+        for name, taken in seconds.items():
+            print(f"| {name} | {taken:.1f} | {taken / seconds['LocalEngine']:.2f} |")
+        print(f"\nsame bit by bit: {all(one == found[0] for one in found)}")
 
 
 @dataclass
@@ -224,4 +248,4 @@ def _same(a: Rollouts, b: Rollouts) -> bool:
 
 
 if __name__ == "__main__":
-    tyro.cli(Ray | Warp | Iteration).run()
+    tyro.cli(Ray | Gap | Warp | Iteration).run()
