@@ -101,32 +101,27 @@ class LocalEngine:
         on_outcome: OnOutcome | None = None,
     ) -> list[R]:
         """See :meth:`Engine.map`."""
-        outcomes = ((i, _attempt(function, task, *shared)) for i, task in enumerate(tasks))
-        return _collect(outcomes, tasks, self._on_progress, on_outcome)
+        return _collect(self._outcomes(function, tasks, shared), tasks, self._on_progress, on_outcome)
+
+    def _outcomes(
+        self, function: Callable[..., R], tasks: Sequence[T], shared: tuple[object, ...]
+    ) -> Iterator[tuple[int, R | Exception]]:
+        """Index of each task, and what it returned or raised, as they end."""
+        for i, task in enumerate(tasks):
+            yield i, _attempt(function, task, *shared)
 
 
-class ThreadEngine:
+class ThreadEngine(LocalEngine):
     """Does as many tasks at once as there are cores, each in a thread of this process.
 
     It pays where tasks simulate much and in small batches: what one does in Python, others simulate meanwhile.
-
-    Args:
-        on_progress: called after each task.
     """
 
     num_threads = 1
 
-    def __init__(self, on_progress: OnProgress | None = None):
-        self._on_progress = on_progress
-
-    def map(
-        self,
-        function: Callable[..., R],
-        tasks: Sequence[T],
-        shared: tuple[object, ...] = (),
-        on_outcome: OnOutcome | None = None,
-    ) -> list[R]:
-        """See :meth:`Engine.map`."""
+    def _outcomes(
+        self, function: Callable[..., R], tasks: Sequence[T], shared: tuple[object, ...]
+    ) -> Iterator[tuple[int, R | Exception]]:
         left, ended = deque(enumerate(tasks)), SimpleQueue[tuple[int, R | Exception]]()
 
         def work() -> None:
@@ -140,7 +135,8 @@ class ThreadEngine:
         for _ in range(min(os.cpu_count() or 1, len(tasks))):
             Thread(target=work, daemon=True).start()  # one that is no daemon would keep Ctrl-C waiting for its task
         try:
-            return _collect((ended.get() for _ in tasks), tasks, self._on_progress, on_outcome)
+            for _ in tasks:
+                yield ended.get()
         finally:
             left.clear()
 
