@@ -10,7 +10,7 @@ import pytest
 from conftest import needs_effects
 from gap_plant import MODEL, record
 
-from simopt_envs.gap import find, find_gap
+from simopt_envs.gap import find, find_gap, search
 from simopt_envs.gap.fit import Misfit
 from simopt_envs.gap.hypothesis import Candidate
 from simopt_envs.gap.motion import motion_of
@@ -19,6 +19,7 @@ from simopt_envs.gap.predictive import HeldOut
 from simopt_envs.gap.recordings import read_windows
 from simopt_envs.gap.search import Search
 from simopt_envs.gap.sizes import of_best_length
+from simopt_envs.gap.thresholds import SHORTER_WINDOWS
 from simopt_envs.physics.effects import EFFECTS
 
 pytestmark = needs_effects
@@ -33,27 +34,43 @@ def _friction(v, peak=0.0):
 
 @pytest.fixture(scope="module")
 def fitted():
-    """The right law fitted, and the data."""
+    """The right law fitted, the data, and what fitted it."""
     plain = plain_parameters(mujoco.MjSpec.from_string(MODEL))
     recordings = record(lambda q, v: _friction(v), np.random.default_rng(0))
     data = read_windows(plain.model, recordings)
-    return Search(plain, data, motion_of(plain.model, recordings), (DRY,)).base((DRY,)), data
+    search = Search(plain, data, motion_of(plain.model, recordings), (DRY,))
+    return search.base((DRY,)), data, search.fit
 
 
 @pytest.mark.parametrize("wrong", [1.5, 1.0])
 def test_shorter_windows_tell_a_size_if_they_predict_what_was_held_out_better(fitted, wrong):
     """A size that is 1.5 times too large is told anew; the right one stays."""
-    base, data = fitted
+    base, data, fit = fitted
     hypothesis, test = base.hypothesis, Misfit(base.hypothesis, data.held_out).with_noise(base.held_out_noise)
     xi = hypothesis.xi(base.fit.u[None])[0]
     xi[hypothesis.columns[DRY]] *= wrong
     u = hypothesis.coordinates(xi)
     given = replace(base, fit=replace(base.fit, u=u), held_out=HeldOut.of(test, u, base.tolerance))
-    found = of_best_length(given, data)
+    found = of_best_length(given, data, fit)
     assert (found is given) == (wrong == 1.0)
     (friction,) = hypothesis.values(DRY, hypothesis.xi(found.fit.u[None])[0]).values()
     assert friction == pytest.approx(FRICTION, rel=0.05)
     assert found.excess <= given.excess
+
+
+def test_fits_to_shorter_windows_are_kept(fitted, tmp_path, monkeypatch):
+    """A second search of the same needs none, and tells of as many."""
+    base, data, _ = fitted
+    shown = []
+
+    def sizes():
+        fit = Search(base.hypothesis.plain, data, base.hypothesis.motion, (DRY,), directory=tmp_path).fit
+        return of_best_length(base, data, fit, lambda *done: shown.append(done))
+
+    found = sizes()
+    monkeypatch.setattr(search, "fit", lambda *_, **__: pytest.fail("a fit is done again"))
+    assert sizes().fit.u.tobytes() == found.fit.u.tobytes()
+    assert shown == [("fit to shorter windows", i, len(SHORTER_WINDOWS)) for i in range(len(SHORTER_WINDOWS))] * 2
 
 
 @pytest.mark.parametrize(("peak", "verdict", "times"), [(2.0, "partly", 1), (0.0, "named", 0)])

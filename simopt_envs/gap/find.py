@@ -143,7 +143,8 @@ def solve(
         search = Search(plain, data, problem.motion, seen, progress, engine, directory, problem.longer, null)
         found = search.run()
         if judge(found) == "partly":
-            found = replace(found, final=of_best_length(found.final, found.data, problem.keyframe))
+            final = of_best_length(found.final, found.data, search.fit, progress, problem.keyframe)
+            found = replace(found, final=final)
         return _gap(problem, found)
 
 

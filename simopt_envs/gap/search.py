@@ -150,12 +150,12 @@ class Search:
         if self._floor is None:  # what the first fit leaves is nearer to noise alone than what the model as given does
             self._progress("fit", 0, 2)
             floor = fitted.noise_floor(u)
-            u = self._fit(fitted.with_noise(fitted.noise_at(u, floor)), u, differences).u
+            u = self.fit(fitted.with_noise(fitted.noise_at(u, floor)), u, differences).u
             self._floor = np.minimum(floor, fitted.noise_floor(u))
         self._progress("fit", 1, 2)
         scale = self._floor * self._tolerance
         noise, held_out_noise = fitted.noise_at(u, scale), held_out.noise_at(u, scale)
-        found = self._fit(fitted.with_noise(noise), u, differences)
+        found = self.fit(fitted.with_noise(noise), u, differences)
         told = HeldOut.of(held_out.with_noise(held_out_noise), found.u, self._tolerance)
         return Base(hypothesis, found, told, noise, held_out_noise, self._tolerance)
 
@@ -218,7 +218,7 @@ class Search:
         """
         base = stage.base
         misfit = Misfit(base.hypothesis, self.data.fitted).with_noise(base.noise)
-        found = self._fit(misfit, self._led_to(stage), DIFFERENCES[1:])
+        found = self.fit(misfit, self._led_to(stage), DIFFERENCES[1:])
         if found.loss >= base.fit.loss - _BETTER:
             return stage
         if base.excess < LARGE:
@@ -318,8 +318,8 @@ class Search:
             trials[refit.screened.candidate] = Trial(refit.screened.hypothesis, Fit(**arrays), held_out)
         return trials
 
-    def _fit(self, misfit: Misfit, start: Array, differences: Sequence[float]) -> Fit:
-        """A fit of all parameters."""
+    def fit(self, misfit: Misfit, start: Array, differences: Sequence[float]) -> Fit:
+        """A fit of all parameters, kept like those of candidates."""
         key = self._key(misfit.hypothesis, misfit.noise, start, np.array(differences))
         return Fit(**self._kept.phase(key, lambda: vars(fit(misfit, start, ITERATIONS, differences=differences))))
 
@@ -385,7 +385,7 @@ class Search:
         misfit = misfit.with_noise(base.noise)
         before = [stage.base.fit.u for stage in stages if stage.base.hypothesis.candidates == left]
         start = misfit.best(np.array([base.hypothesis.without(effect, base.fit.u), *before]))
-        found = self._fit(misfit, start, DIFFERENCES[1:])
+        found = self.fit(misfit, start, DIFFERENCES[1:])
         told = HeldOut.of(test.with_noise(base.held_out_noise), found.u, base.tolerance)
         return Base(hypothesis, found, told, base.noise, base.held_out_noise, base.tolerance)
 

@@ -6,14 +6,14 @@ are of the right form that makes no difference, and long windows tell more.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from simopt_envs.gap.fit import DIFFERENCES, Fit, Misfit, fit
+from simopt_envs.gap.fit import DIFFERENCES, Fit, Misfit
 from simopt_envs.gap.hypothesis import Hypothesis
 from simopt_envs.gap.predictive import HeldOut
-from simopt_envs.gap.refit import ITERATIONS
 from simopt_envs.gap.thresholds import EVIDENCE, SHORTER_WINDOWS
 from simopt_envs.gap.trial import Base, Data
 from simopt_envs.gap.wild_starts import overlap
@@ -21,10 +21,19 @@ from simopt_envs.measured.windows import Windows, cut_windows
 from simopt_envs.physics.effects.actuator_delay import LONGEST
 from simopt_envs.physics.parameters import Array
 
+FitAll = Callable[[Misfit, Array, Sequence[float]], Fit]
+"""Fits all parameters from a start, over differences: :meth:`Search.fit`."""
+
 _ROUNDS = 2  # fits, each in what the one before left
 
 
-def of_best_length(base: Base, data: Data, keyframe: str | None = None) -> Base:
+def of_best_length(
+    base: Base,
+    data: Data,
+    fit: FitAll,
+    progress: Callable[[str, int, int], None] = lambda *_: None,
+    keyframe: str | None = None,
+) -> Base:
     """A base, or the same with the ξ that shorter windows give, if that predicts what was held out better.
 
     By as many nats as are evidence for an effect.
@@ -32,16 +41,19 @@ def of_best_length(base: Base, data: Data, keyframe: str | None = None) -> Base:
     Args:
         base: fitted to the data.
         data: in whose windows held out all are compared.
+        fit: a search's.
+        progress: is told of it.
         keyframe: where joints without a column start.
     """
     hypothesis = base.hypothesis
     misfit = Misfit(hypothesis, data.fitted).with_noise(base.noise)
     test = Misfit(hypothesis, data.held_out).with_noise(base.held_out_noise)
     found = [base.fit.u]
-    for seconds in SHORTER_WINDOWS:
+    for i, seconds in enumerate(SHORTER_WINDOWS):
+        progress("fit to shorter windows", i, len(SHORTER_WINDOWS))
         windows = _shorter(hypothesis, data, seconds, keyframe)
         if windows is not None:
-            found.append(_fitted(base, windows))
+            found.append(_fitted(base, windows, fit))
     left = 0.5 * np.sum(test.errors(np.array(found)) ** 2, axis=(1, 2, 3))
     if left[0] - left.min() < EVIDENCE:
         return base
@@ -62,11 +74,11 @@ def _shorter(hypothesis: Hypothesis, data: Data, seconds: float, keyframe: str |
     return windows.select(np.flatnonzero(~overlap(windows, data.wild)))
 
 
-def _fitted(base: Base, windows: Windows) -> Array:
+def _fitted(base: Base, windows: Windows, fit: FitAll) -> Array:
     """u (d,) fitted to some windows, errors counted in what is left of them."""
     misfit, u = Misfit(base.hypothesis, windows), base.fit.u
     for _ in range(_ROUNDS):
         left = misfit.with_noise(misfit.noise_at(u, base.sensor_noise)).errors(u[None])[0]
         scale = base.sensor_noise * np.maximum(1.0, np.sqrt(np.mean(left**2, axis=(0, 1))))
-        u = fit(misfit.with_noise(misfit.noise_at(u, scale)), u, ITERATIONS, differences=DIFFERENCES[1:]).u
+        u = fit(misfit.with_noise(misfit.noise_at(u, scale)), u, DIFFERENCES[1:]).u
     return u
