@@ -247,6 +247,19 @@ def test_a_spring_that_rests_far_from_where_its_joint_moves_is_a_constant_force(
     assert EFFECTS["joint_spring"].is_itself(model, "joint:drive", MOTION, values) is is_itself
 
 
+@pytest.mark.parametrize(("seen", "is_itself"), [(0.06, False), (0.98, False), (1.02, True), (5.0, True)])
+def test_a_wave_of_which_the_motion_sees_no_whole_period_is_no_cogging(seen: float, is_itself: bool) -> None:
+    model = mujoco.MjModel.from_xml_string(ARM)
+    cogging, i = EFFECTS["cogging"], model.joint("drive").dofadr[0]
+    values = {"amplitude": 1.0, "periods": seen * float(2 * np.pi / (MOTION.high[i] - MOTION.low[i])), "phase": 0.0}
+    assert cogging.is_itself(model, "joint:drive", MOTION, values) is is_itself
+    assert all(
+        cogging.is_itself(model, place, MOTION, probe)
+        for place in cogging.places(model)
+        for probe in cogging.probes(model, place, MOTION)
+    )
+
+
 def test_stribeck_friction_has_its_peak_at_low_speed() -> None:
     def push(t: float) -> float:
         return 8.0 - 5.0 * t

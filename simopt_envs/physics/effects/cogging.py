@@ -18,7 +18,8 @@ from simopt_envs.physics.effects.joints import (
 )
 from simopt_envs.physics.parameters import Parameter, Write
 
-_PERIODS = 0.7 * np.arange(1, 9)  # in the range of the motion: near enough for a fit to find those between
+_PERIODS = 0.7 * np.arange(2, 9)  # in the range of the motion: near enough for a fit to find those between
+_LEAST_PERIODS = 1.0  # in the range of the motion
 _PHASES = np.pi / 3 * np.arange(3)  # amplitudes below 0 are those between
 
 
@@ -62,6 +63,12 @@ class Cogging(Effect):
             {"amplitude": force, "periods": float(k) * base, "phase": float(phase)}
             for k, phase in itertools.product(_PERIODS, _PHASES)
         )
+
+    def is_itself(self, model: mujoco.MjModel, place: str, motion: Motion, values: Values) -> bool:
+        """A wave of which the motion does not see a whole period was not seen to come back: it is a bent spring."""
+        i = dof(model, object_name(place))
+        seen = values["periods"] * float(motion.high[i] - motion.low[i]) / (2 * np.pi)
+        return seen > _LEAST_PERIODS
 
     def usual(self, values: Values) -> dict[str, float]:
         """Of a positive amplitude, with a phase between -pi and pi."""
