@@ -1,4 +1,4 @@
-"""Every threshold of the gap workflow, in one place, so that a change of one is a change of this file.
+"""Every threshold of the search for what is missing, in one place, so that a change of one is a change of this file.
 
 They were set on development seeds of ``benchmarks/hidden_effects`` and frozen in commit 0bfec20, before its test seeds
 were first run. Changed since, with recordings of real hardware and development seeds in sight: ``SIMPLER_SHARE``,
@@ -19,6 +19,9 @@ another order: by gain less price (one case). Since seeds 16000 had, what ``CONF
 all windows, not by those fitted alone (one case), and the interval may hold what its name means, not the fit alone (one
 case). ``FARTHEST`` is new since seeds 17000 had (four cases), and ``LEAST_LEFT`` since seeds 18000 had; until then long
 windows were whole recordings or none, and a threshold more asked that starts are forgotten in them.
+
+What fitted values must be for an effect's name to fit them is with the effects (``Effect.is_itself``): that a cogging
+shows a whole period is asked since seeds 20000 had been run (one case, and one of the gap demonstration).
 """
 
 EVIDENCE = 20.0
