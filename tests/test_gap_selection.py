@@ -111,6 +111,25 @@ def test_a_simpler_law_is_no_other_form_of_one_that_alone_makes_the_model_right(
     assert chosen(null, null, scores) is scores[simple_wins]
 
 
+@pytest.mark.parametrize(
+    ("left", "after", "taken"),
+    [
+        (0.147, 0.017, True),  # a friction beside a load takes nine tenths of what that left
+        (0.147, 0.08, False),  # half of it may be an error of the first one's form
+        (7.0, 1.2, True),
+        (7.0, 3.0, False),
+        (-0.01, -0.05, False),  # nothing is left
+        (9.0, 0.2, True),  # it makes the model right
+    ],
+)
+def test_a_further_effect_that_takes_most_of_what_is_left_is_no_error_of_form(left, after, taken):
+    """It is far less than two per cent of what the first one took."""
+    null: Any = SimpleNamespace(excess=389.0)
+    base: Any = SimpleNamespace(excess=left)
+    score = _score(5, after, 387.0)
+    assert chosen(null, base, [score]) is (score if taken else None)
+
+
 @pytest.mark.parametrize(("fitted", "simple_wins"), [(15.0, False), (23.0, True)])
 def test_a_simpler_law_gives_way_by_all_that_the_data_say(fitted, simple_wins):
     """A spring that earns 25 + 23 nats, its two numbers paid for, and a sensor's scale that earns as many held out."""

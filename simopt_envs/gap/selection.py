@@ -18,6 +18,7 @@ from simopt_envs.gap.thresholds import (
     EXPLAINED,
     FAR,
     FURTHER,
+    REST,
     SIMPLER,
     SIMPLER_LEAVES,
     SIMPLER_SHARE,
@@ -77,13 +78,15 @@ def chosen(null: Base, base: Base, scores: Sequence[Score]) -> Score | None:
 
     A law of slightly another form than the true one leaves an error that nothing in the library describes, but much of
     it bends a little. So a further effect must make the model right, to what noise is, or explain a share of what the
-    ones before it did. Where even the best leaves more than noise, a simpler one that takes, and leaves, nearly as much
-    is as good. Where the best makes the model right, one that does not is not that law in another form; and its form
-    takes no more nats from a law than what it leaves.
+    ones before it did, or most of what they left. Where even the best leaves more than noise, a simpler one that takes,
+    and leaves, nearly as much is as good. Where the best makes the model right, one that does not is not that law in
+    another form; and its form takes no more nats from a law than what it leaves.
     """
     earned, right = [score for score in scores if score.earned], EXPLAINED - 1
     if base is not null:
         least = FURTHER * (null.excess - base.excess)
+        if base.excess > 0:
+            least = min(least, REST * base.excess)
         earned = [
             s
             for s in earned
