@@ -18,7 +18,7 @@ from simopt_envs.gap.thresholds import (
     EXPLAINED,
     FAR,
     FURTHER,
-    REST,
+    LEFT_SHARE,
     SIMPLER,
     SIMPLER_LEAVES,
     SIMPLER_SHARE,
@@ -86,7 +86,7 @@ def chosen(null: Base, base: Base, scores: Sequence[Score]) -> Score | None:
     if base is not null:
         least = FURTHER * (null.excess - base.excess)
         if base.excess > 0:
-            least = min(least, REST * base.excess)
+            least = min(least, LEFT_SHARE * base.excess)
         earned = [
             s
             for s in earned

@@ -19,7 +19,7 @@ another order: by gain less price (one case). Since seeds 16000 had, what ``CONF
 all windows, not by those fitted alone (one case), and the interval may hold what its name means, not the fit alone (one
 case). ``FARTHEST`` is new since seeds 17000 had (four cases), and ``LEAST_LEFT`` since seeds 18000 had; until then long
 windows were whole recordings or none, and a threshold more asked that starts are forgotten in them.
-``REST`` is new since seeds 22000 had been run (one case).
+``LEFT_SHARE`` is new since seeds 22000 had been run (one case).
 
 What fitted values must be for an effect's name to fit them is with the effects (``Effect.is_itself``): that a cogging
 shows a whole period is asked since seeds 20000 had been run (one case, and one of the gap demonstration).
@@ -49,9 +49,9 @@ tells little."""
 
 FURTHER = 0.02
 """Share of the held-out excess removed so far that a further effect must add, unless it makes the model right
-or takes the share ``REST`` of what is left."""
+or takes the share ``LEFT_SHARE`` of what is left."""
 
-REST = 0.8
+LEFT_SHARE = 0.8
 """Share of the held-out excess that is left from which a further effect need not add so much: of what a law of another
 form leaves, no one effect takes most."""
 
