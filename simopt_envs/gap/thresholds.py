@@ -49,11 +49,11 @@ tells little."""
 
 FURTHER = 0.02
 """Share of the held-out excess removed so far that a further effect must add, unless it makes the model right
-or takes the share ``LEFT_SHARE`` of what is left."""
+or takes most of what is left (``LEFT_SHARE``)."""
 
 LEFT_SHARE = 0.8
-"""Share of the held-out excess that is left from which a further effect need not add so much: of what a law of another
-form leaves, no one effect takes most."""
+"""Share of the held-out excess left so far that a further effect may take instead of ``FURTHER``: of what a law of
+another form leaves, one effect is taken not to explain so much."""
 
 LEAST_SHARE = 0.35
 """Share of the held-out excess that the effects must take away, or make the median window right, or the gap is
