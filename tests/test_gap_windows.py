@@ -17,6 +17,7 @@ from simopt_envs.gap import find_gap
 from simopt_envs.gap.fit import Misfit, by_part
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
 from simopt_envs.gap.motion import motion_of
+from simopt_envs.gap.outliers import without_outliers
 from simopt_envs.gap.plain import Plain, plain_parameters
 from simopt_envs.gap.recordings import longer_windows, read_windows
 from simopt_envs.gap.search import Search
@@ -247,6 +248,42 @@ def test_a_search_leaves_out_a_window_that_bends_the_fits_of_what_explains_the_o
     if push:
         (size,) = found.final.hypothesis.values(BIAS, found.final.hypothesis.xi(found.final.fit.u[None])[0]).values()
         assert size == pytest.approx(push, abs=0.002)
+
+
+@needs_effects
+@pytest.mark.parametrize(
+    ("base", "candidate", "left_out"),
+    [
+        ([1.3, 9.0, 1.2, 1.3], [1.0, 8.5, 1.0, 1.0], [1]),
+        ([1.3, 9.0, 1.2, 1.3], [1.0, 4.0, 1.0, 1.0], []),  # it takes most of it
+        ([1.3, 4.0, 1.2, 1.3], [1.0, 3.9, 1.0, 1.0], [1]),  # in its last half alone
+        ([1.3, 1.9, 1.2, 1.3], [1.0, 1.9, 1.0, 1.0], []),  # it makes the model right, to what noise is
+        ([2.3, 9.0, 2.2, 2.3], [2.0, 8.5, 2.0, 2.0], []),  # it does not explain the others either
+        ([9.0, 9.0, 9.0, 1.3], [8.5, 8.5, 8.5, 1.0], []),
+    ],
+)
+def test_a_window_is_an_outlier_where_the_candidate_that_explains_the_others_takes_little_of_it(
+    base, candidate, left_out
+):
+    """Windows of 1 s; what a mean square is above 1.5 is of their last half."""
+
+    def trial(mean_squares: list[float]) -> Any:
+        squares = np.minimum(mean_squares, 1.5)[:, None, None] * np.ones((1, 100, 2))
+        squares[:, 50:] += 2 * np.maximum(np.array(mean_squares) - 1.5, 0.0)[:, None, None]
+        errors = np.sqrt(squares)
+        fit = SimpleNamespace(errors=np.ones_like(errors))
+        return SimpleNamespace(
+            fit=fit, held_out=SimpleNamespace(errors=errors), excess=np.mean(squares) - 1, tolerance=1
+        )
+
+    _, windows, recordings = of_pushed_rods([0.0, 3.0, 3.1, 3.2])
+    data = Data(windows, windows, recordings, recordings)
+    stage: Any = SimpleNamespace(base=trial(base), scores=[SimpleNamespace(trial=trial(candidate))])
+    found = without_outliers(stage, data)
+    assert found.fitted is data.fitted
+    assert found.held_out.recording == tuple(f"run_{i}" for i in range(4) if i not in left_out)
+    assert [name for name, _, _ in found.outliers] == [f"run_{i}" for i in left_out]
+    assert len(found.warnings) == len(left_out)
 
 
 @needs_effects

@@ -214,13 +214,13 @@ def judge(explanation: Explanation) -> Verdict:
     """The verdict on a search, from what is left on recordings that no fit saw.
 
     Effects that take away too little are no explanation, unless they make the median window right: then what is left is
-    of a few, in which something else happens as well.
+    of a few, in which something else happens as well. So it is where windows were left out as outliers.
     """
-    right = explanation.final.unforeseen < EXPLAINED - 1
+    right, whole = explanation.final.unforeseen < EXPLAINED - 1, not explanation.data.outliers
     if not explanation.effects:
-        return "none" if right else "unexplained"
+        return "none" if right and whole else "unexplained"
     if right:
-        return "named"
+        return "named" if whole else "partly"
     before, after = (of_median_window(base.held_out.errors) for base in (explanation.null, explanation.final))
     enough = explanation.final.excess < (1 - LEAST_SHARE) * explanation.null.excess or after < EXPLAINED < before
     return "partly" if enough else "unexplained"

@@ -17,6 +17,7 @@ from simopt_envs.gap.fit import DIFFERENCES, Fit, Misfit, fit
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
 from simopt_envs.gap.kept import kept_fits, key_of
 from simopt_envs.gap.large import SECONDS, nearest_size, of_several_effects
+from simopt_envs.gap.outliers import without_outliers
 from simopt_envs.gap.plain import SPEAKS_FOR, Plain
 from simopt_envs.gap.predictive import HeldOut
 from simopt_envs.gap.refit import ITERATIONS, Refit, extended, fitted, grown
@@ -118,23 +119,25 @@ class Search:
         return base
 
     def _first(self, base: Base) -> Stage:
-        """The first stage, on windows whose start does not decide.
+        """The first stage, on windows whose start does not decide, and in which nothing happened that none explains.
 
-        Where the base is far from the data, the few candidates that come nearest at some size may tell of such windows
-        before all others are fitted. Where none of these windows was fitted, fits stand.
+        Where the base is far from the data, the few candidates that come nearest at some size may tell of wild windows
+        before all others are fitted. Where none of those left out was fitted, fits stand.
         """
-        look = None
-        if base.excess >= LARGE:
-            look = self._look(base)
-            if look is None:
-                return self.stage(self.base())
+        look = self._look(base) if base.excess >= LARGE else None
+        if look is not None:
             base = look.base
-        stage = self._without_wild(self.stage(base, look))
-        return self.stage(self.base()) if stage is None else stage
+        elif base.excess >= LARGE:
+            base = self.base()
+        stage = self._without_wild(self.stage(base, look)) or self.stage(self.base())
+        return self._of_fewer(stage, without_outliers(stage, self.data)) or self.stage(self.base())
 
     def _without_wild(self, stage: Stage) -> Stage | None:
         """A stage without the windows whose start, as it tells, decides; None where fits had been to some of them."""
-        before, self.data = self.data, without_starts_told_wild(stage, self.data)
+        return self._of_fewer(stage, without_starts_told_wild(stage, self.data))
+
+    def _of_fewer(self, stage: Stage, data: Data) -> Stage | None:
+        before, self.data = self.data, data
         if self.data is before:
             return stage
         if self.data.fitted is not before.fitted:

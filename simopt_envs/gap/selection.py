@@ -65,12 +65,14 @@ class Score:
         """Whether it shows in what was fitted, and in recordings that no fit saw.
 
         The latter may tell alone, as where what was fitted hardly went where the effect acts: there is no price to pay
-        for parameters that they had no part in. Less is asked of an effect that plain parameters can stand in for: all
-        it can show is how far they had to go.
+        for parameters that they had no part in. Where they hardly went there, they need only not speak against it.
+        Less is asked of an effect that plain parameters can stand in for: all it can show is how far they had to go.
         """
         all_it_can = self.candidate.effect.name in SPEAKS_FOR.values() and self.was_stood_in_for
         least, in_all = (0.0, 0.0) if all_it_can else (EVIDENCE_EACH, EVIDENCE)
-        return (min(self.fitted, self.held_out) > least or self.held_out > EVIDENCE) and self.total > in_all
+        least_held_out = 0.0 if self.fitted > EVIDENCE else least
+        on_both = self.fitted > least and self.held_out > least_held_out
+        return (on_both or self.held_out > EVIDENCE) and self.total > in_all
 
 
 def chosen(null: Base, base: Base, scores: Sequence[Score]) -> Score | None:

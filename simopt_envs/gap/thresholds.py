@@ -19,7 +19,8 @@ another order: by gain less price (one case). Since seeds 16000 had, what ``CONF
 all windows, not by those fitted alone (one case), and the interval may hold what its name means, not the fit alone (one
 case). ``FARTHEST`` is new since seeds 17000 had (four cases), and ``LEAST_LEFT`` since seeds 18000 had; until then long
 windows were whole recordings or none, and a threshold more asked that starts are forgotten in them.
-``LEFT_SHARE`` is new since seeds 22000 had been run (one case).
+``LEFT_SHARE`` is new since seeds 22000 had been run (one case). Since then, too, outliers are left out (two cases), and
+held-out windows need only not speak against what those fitted show by ``EVIDENCE`` alone (one case).
 
 What fitted values must be for an effect's name to fit them is with the effects (``Effect.is_itself``): that a cogging
 shows a whole period is asked since seeds 20000 had been run (one case, and one of the gap demonstration).
@@ -30,7 +31,8 @@ EVIDENCE = 20.0
 windows for sizes to be theirs."""
 
 EVIDENCE_EACH = 5.0
-"""Nats that it must earn on either, unless those on the windows held out are as many as are asked of both."""
+"""Nats that it must earn on either, unless those on the windows held out are as many as are asked of both, or those on
+the windows fitted are and held-out ones do not speak against it."""
 
 EXPLAINED = 1.25
 """Mean square of the whitened errors up to which a model counts as right; noise alone leaves 1."""
@@ -103,7 +105,8 @@ WILD = 1.0
 
 OUTLYING = 5.0
 """Times what a candidate leaves of the median window, from which what it leaves of such a window, or the start may make
-of it, has it left out, too: where the model as given leaves ``LARGE`` times as much as that, it could not tell."""
+of it, has it left out, too: where the model as given leaves ``LARGE`` times as much as that, it could not tell. Or in
+some part of it, where it is an outlier: no candidate takes half of that, and the best one makes the median right."""
 
 SHORTER_WINDOWS = (0.2, 0.1)
 """Seconds of the windows by which sizes are told too, where no model is right. New since 62c9aa6, and set with EMPS and

@@ -19,6 +19,9 @@ from simopt_envs.measured.recording import Finding, Recording
 from simopt_envs.measured.windows import Windows
 from simopt_envs.physics.parameters import Array
 
+Stretch = tuple[str, float, float]
+"""Of a recording, by its name, from when to when [s]."""
+
 
 @dataclass(frozen=True)
 class Data:
@@ -29,6 +32,7 @@ class Data:
         fitted_recordings, held_out_recordings: what they are cut from.
         warnings: of the recordings' audit.
         wild: the windows left out as all depends on how exactly they start: the recording, and from when to when [s].
+        outliers: the same of those left out as something happened in them that no candidate explains.
     """
 
     fitted: Windows
@@ -36,7 +40,8 @@ class Data:
     fitted_recordings: tuple[Recording, ...]
     held_out_recordings: tuple[Recording, ...]
     warnings: tuple[Finding, ...] = ()
-    wild: tuple[tuple[str, float, float], ...] = ()
+    wild: tuple[Stretch, ...] = ()
+    outliers: tuple[Stretch, ...] = ()
 
     @property
     def seconds(self) -> float:
@@ -47,6 +52,25 @@ class Data:
     def parts(self) -> int:
         """How many times as long as the shortest a window is."""
         return max(1, round(self.seconds / WINDOW))
+
+    def of_those(self, fitted: NDArray[np.bool_], held_out: NDArray[np.bool_], warning: Finding) -> Self:
+        """The windows that are told, (w,) of each, and a warning that the others are left out."""
+        few = [
+            windows if rows.all() else windows.select(np.flatnonzero(rows))
+            for windows, rows in self._of_each(fitted, held_out)
+        ]
+        return replace(self, fitted=few[0], held_out=few[1], warnings=(*self.warnings, warning))
+
+    def stretches(self, fitted: NDArray[np.bool_], held_out: NDArray[np.bool_]) -> tuple[Stretch, ...]:
+        """Where the windows are that are told, (w,) of each."""
+        return tuple(
+            (windows.recording[i], float(windows.start_time[i]), float(windows.start_time[i] + windows.seconds))
+            for windows, rows in self._of_each(fitted, held_out)
+            for i in np.flatnonzero(rows)
+        )
+
+    def _of_each(self, *rows: NDArray[np.bool_]) -> list[tuple[Windows, NDArray[np.bool_]]]:
+        return list(zip((self.fitted, self.held_out), rows, strict=True))
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from simopt_envs.gap.fit import DIFFERENCES, Misfit, fit
 from simopt_envs.gap.hypothesis import Hypothesis
 from simopt_envs.gap.refit import ITERATIONS
 from simopt_envs.gap.thresholds import BENT, LARGE, LEAST_LEFT, OUTLYING, WILD
-from simopt_envs.gap.trial import Base, Data, afresh, of_median_window
+from simopt_envs.gap.trial import Base, Data, Stretch, afresh, of_median_window
 from simopt_envs.measured.recording import Finding
 from simopt_envs.measured.windows import Windows
 from simopt_envs.physics.parameters import Array
@@ -91,16 +91,11 @@ def _of_those(data: Data, fitted: NDArray[np.bool_], held_out: NDArray[np.bool_]
     if np.all(kept):
         return data
     message = f"{np.sum(~kept)} of {len(kept)} left out, where all depends on how exactly they start"
-    warning = Finding.warning("windows", "start", message)
-    few, wild = [], list(data.wild)
-    for windows, rows in ((data.fitted, fitted), (data.held_out, held_out)):
-        few.append(windows.select(np.flatnonzero(rows)))
-        starts = windows.start_time.tolist()
-        wild += [(windows.recording[i], starts[i], starts[i] + windows.seconds) for i in np.flatnonzero(~rows)]
-    return replace(data, fitted=few[0], held_out=few[1], warnings=(*data.warnings, warning), wild=tuple(wild))
+    left = data.of_those(fitted, held_out, Finding.warning("windows", "start", message))
+    return replace(left, wild=data.wild + data.stretches(~fitted, ~held_out))
 
 
-def overlap(windows: Windows, stretches: Sequence[tuple[str, float, float]]) -> NDArray[np.bool_]:
+def overlap(windows: Windows, stretches: Sequence[Stretch]) -> NDArray[np.bool_]:
     """Which windows share time with any of some stretches of recordings, (w,)."""
     within = np.zeros(len(windows), dtype=bool)
     for name, begin, end in stretches:
