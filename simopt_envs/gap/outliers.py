@@ -13,18 +13,17 @@ from numpy.typing import NDArray
 
 from simopt_envs.gap.explanation import Stage
 from simopt_envs.gap.fit import by_part
-from simopt_envs.gap.thresholds import EXPLAINED, OUTLYING
+from simopt_envs.gap.thresholds import EXPLAINED, OUTLYING, UNTAKEN
 from simopt_envs.gap.trial import Data, of_median_window
 from simopt_envs.measured.recording import Finding
 from simopt_envs.physics.parameters import Array
 
-_TAKEN = 0.5  # of a window's error: a candidate that takes more may well be what it is of
-
 
 def without_outliers(stage: Stage, data: Data) -> Data:
-    """Without the outliers: windows with a part of which all candidates leave far more than the median window's error.
+    """Without the outliers: windows with a part of which all candidates leave far more than the best of the median one.
 
-    Only where the best makes the median window right, but not all together. If they were more than half, all stay.
+    None may take much of it either, as the effect that it is of would, in whatever form. Only where the best makes the
+    median window right, but not all together. If they were more than half, all stay.
     """
     trials = [stage.base, *(score.trial for score in stage.scores)]
     best = min(trials, key=lambda trial: trial.excess)
@@ -44,9 +43,9 @@ def without_outliers(stage: Stage, data: Data) -> Data:
 
 
 def _astray(left: list[Array], most: float) -> NDArray[np.bool_]:
-    """Which windows all trials, the base first, leave more of than is told, and near to what the base leaves, (w,)."""
+    """Of which windows all trials, the base first, leave more than is told, and most of what the base leaves, (w,)."""
     least = np.min(left, axis=0)
-    astray: NDArray[np.bool_] = (least > most) & (least > (1 - _TAKEN) * left[0])
+    astray: NDArray[np.bool_] = (least > most) & (least > UNTAKEN * left[0])
     return astray
 
 

@@ -105,8 +105,11 @@ WILD = 1.0
 
 OUTLYING = 5.0
 """Times what a candidate leaves of the median window, from which what it leaves of such a window, or the start may make
-of it, has it left out, too: where the model as given leaves ``LARGE`` times as much as that, it could not tell. Or in
-some part of it, where it is an outlier: no candidate takes half of that, and the best one makes the median right."""
+of it, has it left out, too: where the model as given leaves ``LARGE`` times as much as that, it could not tell. Times
+what the best candidate leaves of the median window, from which what all leave of some other makes that an outlier."""
+
+UNTAKEN = 0.5
+"""Share of what the model as given leaves of an outlier that all candidates leave, too."""
 
 SHORTER_WINDOWS = (0.2, 0.1)
 """Seconds of the windows by which sizes are told too, where no model is right. New since 62c9aa6, and set with EMPS and
