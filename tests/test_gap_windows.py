@@ -272,9 +272,7 @@ def test_a_window_is_an_outlier_where_the_candidate_that_explains_the_others_tak
         squares[:, 50:] += 2 * np.maximum(np.array(mean_squares) - 1.5, 0.0)[:, None, None]
         errors = np.sqrt(squares)
         fit = SimpleNamespace(errors=np.ones_like(errors))
-        return SimpleNamespace(
-            fit=fit, held_out=SimpleNamespace(errors=errors), excess=np.mean(squares) - 1, tolerance=1
-        )
+        return SimpleNamespace(fit=fit, held_out=SimpleNamespace(errors=errors), excess=np.mean(squares) - 1)
 
     _, windows, recordings = of_pushed_rods([0.0, 3.0, 3.1, 3.2])
     data = Data(windows, windows, recordings, recordings)

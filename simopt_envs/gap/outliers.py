@@ -24,6 +24,10 @@ def without_outliers(stage: Stage, data: Data) -> Data:
 
     None may take much of it either, as the effect that it is of would, in whatever form. Only where the best makes the
     median window right, but not all together. If they were more than half, all stay.
+
+    Args:
+        stage: the first, whose fits count errors in the sensors' noise.
+        data: that it is of.
     """
     trials = [stage.base, *(score.trial for score in stage.scores)]
     best = min(trials, key=lambda trial: trial.excess)
@@ -32,7 +36,7 @@ def without_outliers(stage: Stage, data: Data) -> Data:
         return data
     fitted, held_out = (
         _astray([_of_worst_part(errors, data.parts) for errors in of_each], OUTLYING * max(median, 1.0))
-        for of_each in ([t.fit.errors * stage.base.tolerance for t in trials], [t.held_out.errors for t in trials])
+        for of_each in ([t.fit.errors for t in trials], [t.held_out.errors for t in trials])
     )
     count, total = int(np.sum(fitted) + np.sum(held_out)), len(fitted) + len(held_out)
     if count == 0 or max(np.mean(fitted), np.mean(held_out)) > 0.5:
