@@ -141,7 +141,7 @@ class Warp:
 
     def run(self) -> None:
         """Measure and print."""
-        print(f"{os.cpu_count()} CPU cores, Warp on {self.device}\n")
+        print(f"{len(os.sched_getaffinity(0))} CPU cores, Warp on {self.device}\n")
         print("| | worlds | control steps/s | ÷ CPU | begin an episode [s] | diverged |\n|---|---|---|---|---|---|")
         for env_id in (DRAWER, SWING_PEG):
             cpu = self._rate(env_id, self.cpu_worlds, {}, 1.0, "CPU")

@@ -1,4 +1,5 @@
-"""MuJoCo Warp, on its CPU device: the same worlds as MuJoCo's to single precision, and what a vector env must do.
+"""MuJoCo Warp, on its CPU device and on a GPU where there is one: the same worlds as MuJoCo's to single precision, and
+what a vector env must do.
 
 Compiling Warp's kernels takes half a minute the first time; they are then kept in Warp's cache.
 """
@@ -20,12 +21,13 @@ from simopt_envs.physics.simulation import BatchSimulation
 
 pytest.importorskip("mujoco_warp", reason="MuJoCo Warp is not installed")
 import torch
+import warp as wp
 
+from simopt_envs.physics.arrays import to_numpy
 from simopt_envs.physics.warp_simulation import WarpSimulation
 from simopt_envs.tasks.vector_env import TaskVectorEnv
 
 TASKS = ("SimOpt/Drawer-v0", "SimOpt/SwingPeg-v0")
-ON_CPU = {"backend": "warp", "device": "cpu"}
 BALL = """
 <mujoco>
   <option timestep="0.004" integrator="implicitfast"/>
@@ -44,6 +46,17 @@ TABLE = ParameterSpace(
 )
 
 
+@pytest.fixture(params=[device.alias for device in wp.get_devices()])
+def on_device(request):
+    """The options of a vector env on each of Warp's devices in turn."""
+    return {"backend": "warp", "device": request.param}
+
+
+def close(actual, desired, atol):
+    """Arrays, wherever they are, alike to a tolerance."""
+    np.testing.assert_allclose(to_numpy(actual), to_numpy(desired), atol=atol)
+
+
 def drawn(space, n, seed=0):
     """ξ with every parameter off its nominal, (n, d)."""
     z = Gaussian.around_nominal(space, std=np.where([p.coordinate == "log" for p in space], 0.2, 0.01))
@@ -51,37 +64,37 @@ def drawn(space, n, seed=0):
 
 
 @pytest.mark.parametrize("env_id", TASKS)
-def test_the_trajectories_are_those_of_mujoco(env_id):
+def test_the_trajectories_are_those_of_mujoco(env_id, on_device):
     """20 control steps under a ξ per world: observations to 1e-4 (rad, m), rewards to 1e-3."""
     n = 6
     exact = gym.make_vec(env_id, n, autoreset_mode="Disabled")
-    single = gym.make_vec(env_id, n, autoreset_mode="Disabled", **ON_CPU)
+    single = gym.make_vec(env_id, n, autoreset_mode="Disabled", **on_device)
     xi = drawn(exact.unwrapped.parameters, n)
     expected, _ = exact.reset(seed=3, options={"parameters": xi})
     observed, info = single.reset(seed=3, options={"parameters": xi})
-    np.testing.assert_allclose(observed, expected, atol=1e-5)
+    close(observed, expected, atol=1e-5)
     np.testing.assert_array_equal(info["parameters"], xi)
     rng = np.random.default_rng(0)
     for _ in range(20):
         action = np.tile(rng.uniform(-1, 1, exact.single_action_space.shape), (n, 1))
         expected, reward, *_, told = exact.step(action)
         observed, single_reward, _, _, single_told = single.step(torch.as_tensor(action))
-        np.testing.assert_allclose(observed, expected, atol=1e-4)
-        np.testing.assert_allclose(single_reward, reward, atol=1e-3)
+        close(observed, expected, atol=1e-4)
+        close(single_reward, reward, atol=1e-3)
         for name, term in told["reward_terms"].items():
-            np.testing.assert_allclose(single_told["reward_terms"][name], term, atol=1e-3)
+            close(single_told["reward_terms"][name], term, atol=1e-3)
     assert np.abs(expected[0] - expected[1:]).max(axis=1).min() > 5e-3  # ξ makes far more of a difference
     for field in ("site_xpos", "site_xmat", "xpos", "qvel"):
         actual = single.unwrapped.simulation.data(field)
-        np.testing.assert_allclose(actual, exact.unwrapped.simulation.data(field), atol=2e-3)
+        close(actual, exact.unwrapped.simulation.data(field), atol=2e-3)
 
 
-def test_a_table_that_cannot_move_stands_where_xi_puts_it():
+def test_a_table_that_cannot_move_stands_where_xi_puts_it(on_device):
     """Contacts with a body welded to the world, placed and sized by each world's ξ, also after others reset."""
     model = mujoco.MjModel.from_xml_string(BALL)
     xi = np.array([[0.0, 0.1, 4.19], [0.3, 0.1, 1.0], [-0.5, 0.05, 4.19], [0.0, 0.2, 20.0]])
     rests = {}
-    for make in (BatchSimulation, partial(WarpSimulation, device="cpu")):
+    for make in (BatchSimulation, partial(WarpSimulation, device=on_device["device"])):
         simulation = make(model, TABLE, 4)
         for worlds in ([0, 1, 2, 3], [2]):
             worlds = np.array(worlds)
@@ -90,17 +103,17 @@ def test_a_table_that_cannot_move_stands_where_xi_puts_it():
         for _ in range(3):
             diverged = simulation.step(simulation.asarray(np.zeros((4, 0))), 200)
         assert not diverged.any()
-        rests[make] = np.asarray(simulation.data("xpos")[:, 2, 2])
+        rests[make] = to_numpy(simulation.data("xpos"))[:, 2, 2]
     exact, single = rests.values()
-    np.testing.assert_allclose(single, exact, atol=1e-4)
-    np.testing.assert_allclose(exact, 1.0 + xi[:, 0] + xi[:, 1] + 0.1, atol=2e-3)  # table, its half thickness, ball
+    close(single, exact, atol=1e-4)
+    close(exact, 1.0 + xi[:, 0] + xi[:, 1] + 0.1, atol=2e-3)  # table, its half thickness, ball
 
 
 @pytest.mark.parametrize("mode", ["SameStep", "NextStep"])
-def test_some_worlds_reset_and_the_others_do_not_notice(mode):
+def test_some_worlds_reset_and_the_others_do_not_notice(mode, on_device):
     """Both autoresets against MuJoCo's, worlds out of step with each other; all that comes is on the device."""
     make = partial(TaskVectorEnv, ToyTask(), 4, max_episode_steps=6, autoreset_mode=mode)
-    exact, single = make(), make(**ON_CPU)
+    exact, single = make(), make(**on_device)
     rng = np.random.default_rng(0)
     xi = rng.uniform(0.5, 4.0, (4, 2))
     for env in (exact, single):
@@ -113,29 +126,29 @@ def test_some_worlds_reset_and_the_others_do_not_notice(mode):
             before = single.simulation.data("qpos")[1:3].clone()
             expected, observed = exact.reset(options=options)[0], single.reset(options=options)[0]
             torch.testing.assert_close(single.simulation.data("qpos")[1:3], before, rtol=0, atol=0)
-            np.testing.assert_allclose(observed, expected, atol=1e-5)
+            close(observed, expected, atol=1e-5)
         *expected, told = exact.step(action)
         *observed, single_told = single.step(torch.as_tensor(action))
         for mine, theirs in zip(observed, expected, strict=True):
             assert isinstance(mine, torch.Tensor)
-            np.testing.assert_allclose(mine, theirs, atol=1e-5)
+            close(mine, theirs, atol=1e-5)
         assert ("final_obs" in single_told) == ("final_obs" in told)
         if "final_obs" in told:
             done = told["_final_obs"]
-            np.testing.assert_array_equal(single_told["_final_obs"], done)
-            np.testing.assert_allclose(single_told["final_obs"][done], np.stack(told["final_obs"][done]), atol=1e-5)
+            np.testing.assert_array_equal(to_numpy(single_told["_final_obs"]), done)
+            close(to_numpy(single_told["final_obs"])[done], np.stack(told["final_obs"][done]), atol=1e-5)
     assert single.diverged_count == 0
 
 
-def test_delayed_servo_starts_from_its_first_command():
-    env = TaskVectorEnv(ToyTask(), 3, **ON_CPU)
+def test_delayed_servo_starts_from_its_first_command(on_device):
+    env = TaskVectorEnv(ToyTask(), 3, **on_device)
     first, _ = env.reset(seed=0)
     second, *_ = env.step(torch.zeros(3, 1))
     torch.testing.assert_close(second, first, atol=1e-6, rtol=0)
 
 
-def test_a_world_that_diverges_ends_its_episode_alone():
-    env = TaskVectorEnv(ToyTask(), 3, autoreset_mode="SameStep", **ON_CPU)
+def test_a_world_that_diverges_ends_its_episode_alone(on_device):
+    env = TaskVectorEnv(ToyTask(), 3, autoreset_mode="SameStep", **on_device)
     before, _ = env.reset(seed=0)
     env.simulation.data("qvel")[1] = torch.nan
     after, reward, terminated, truncated, info = env.step(torch.zeros(3, 1))
@@ -149,7 +162,7 @@ def test_a_world_that_diverges_ends_its_episode_alone():
     assert not info["diverged"].any()
 
 
-def test_the_driver_rolls_out_on_it():
+def test_the_driver_rolls_out_on_it(on_device):
     """Simulated rollouts of the loop: repeated measured episodes, on the host, as from MuJoCo."""
 
     class Wander:
@@ -159,23 +172,23 @@ def test_the_driver_rolls_out_on_it():
 
     real = HiddenSystem(TASKS[0], {"cabinet_x": 0.05}).rollout(Wander(), 2, np.random.default_rng(0))
     results = []
-    for options in ({}, ON_CPU):
+    for options in ({}, on_device):
         simulator = EnvSimulator(TASKS[0], num_envs=8, **options)
         space = simulator.parameters.subset(["cabinet_x", "latency"])
         results.append(simulator.rollout(Wander(), space, np.array([[0.05, 0.008], [-0.1, 0.02]]), real, 0))
     exact, single = results
-    np.testing.assert_allclose(single.observations, exact.observations, atol=2e-3)
-    np.testing.assert_allclose(single.observations[0], np.stack([t.observations for t in real]), atol=2e-3)
+    close(single.observations, exact.observations, atol=2e-3)
+    close(single.observations[0], np.stack([t.observations for t in real]), atol=2e-3)
     assert np.abs(single.observations[1] - single.observations[0]).max() > 0.1
-    assert EnvSimulator(TASKS[0], **ON_CPU).identity() != EnvSimulator(TASKS[0]).identity()
+    assert EnvSimulator(TASKS[0], **on_device).identity() != EnvSimulator(TASKS[0]).identity()
 
 
-def test_ppo_trains_on_it():
+def test_ppo_trains_on_it(on_device):
     from baselines.ppo_torch import PPOConfig, TorchPPO
 
     space = ToyTask.parameters
     policy = TorchPPO(PPOConfig(num_envs=8, num_steps=10, iterations=2))(
-        lambda n: TaskVectorEnv(ToyTask(), n, 10, "SameStep", **ON_CPU), None, np.random.default_rng(0)
+        lambda n: TaskVectorEnv(ToyTask(), n, 10, "SameStep", **on_device), None, np.random.default_rng(0)
     )
     assert policy.steps_trained == 160
     assert np.isfinite(policy.act(space.nominal[None, :1])).all()
@@ -203,7 +216,7 @@ def test_without_warp_the_error_names_the_extra(monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("env_id", TASKS)
-def test_one_policy_succeeds_as_often(env_id):
+def test_one_policy_succeeds_as_often(env_id, on_device):
     """200 episodes of a policy trained on MuJoCo, the same starts and ξ: both rates within each other's interval."""
     from scipy.stats import binomtest
 
@@ -217,7 +230,7 @@ def test_one_policy_succeeds_as_often(env_id):
         dict(zip(p.space.names, p.sample(200, np.random.default_rng(1)).T, strict=True)), 200
     )
     successes = []
-    for options in ({}, ON_CPU):
+    for options in ({}, on_device):
         env = EnvSimulator(env_id, **options).make_worlds(200)
         observation, _ = env.reset(seed=0, options={"parameters": xi})
         for _ in range(50):
