@@ -10,6 +10,7 @@ import numpy as np
 from simopt_envs.engine import Engine, counted
 from simopt_envs.gap.fit import Misfit
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
+from simopt_envs.gap.thresholds import EVIDENCE
 from simopt_envs.gap.trial import Base
 from simopt_envs.measured.windows import Windows
 from simopt_envs.physics.parameters import Array
@@ -17,6 +18,8 @@ from simopt_envs.physics.parameters import Array
 _STEPS = np.array([1.0, 0.3, 0.1, 0.03])  # shares of the screen's step that a fit may start from
 _WORTH_A_START = 0.2  # share of the best probe's gain at which a fit may start from another one
 _FURTHEST = 20.0  # probes that the screen's step may be long
+_LEAST_CHANGE = np.sqrt(2 * EVIDENCE)  # of the errors together, in standard deviations, that can earn so many nats
+_LARGER = 10.0  # times the size of a probe that changes less
 
 
 @dataclass(frozen=True)
@@ -57,34 +60,41 @@ def screen(
     hypotheses = [Hypothesis(plain, [*effects, c], motion) for c in lacking]
     shared = base, windows, engine.num_threads
     made = engine.map(_made_by_probes, hypotheses, shared, counted(progress, len(lacking)))
-    found = [_screened(*one, base) for one in zip(hypotheses, made, strict=True)]
+    found = [_screened(hypothesis, *one, base) for hypothesis, one in zip(hypotheses, made, strict=True)]
     price = 0.5 * np.log(base.fit.errors.size)
     return sorted(found, key=lambda s: price * len(s.hypothesis.columns[s.candidate]) - s.gain)
 
 
-def _made_by_probes(hypothesis: Hypothesis, base: Base, windows: Windows, num_threads: int) -> Array:
-    """What each probe of a hypothesis' last candidate changes in a base's errors, (n, w, S, c)."""
+def _made_by_probes(hypothesis: Hypothesis, base: Base, windows: Windows, num_threads: int) -> tuple[Array, Array]:
+    """The probes (n, d) of a hypothesis' last candidate, and what each changes in a base's errors, (n, w, S, c).
+
+    Of one that changes less than an effect must to earn its name, a larger one is a probe, too: where things touch,
+    what is smaller than that drowns in what any change of the model does.
+    """
+    candidate = hypothesis.candidates[-1]
+    misfit = Misfit(hypothesis, windows, num_threads).with_noise(base.noise)
     without = hypothesis.neutral()
     without[: len(base.fit.u)] = base.fit.u
-    tried = np.concatenate([without[None], _probes(hypothesis, base)])  # a structure alone changes a little
-    errors = Misfit(hypothesis, windows, num_threads).with_noise(base.noise).errors(tried)
-    return errors[1:] - errors[0]
-
-
-def _probes(hypothesis: Hypothesis, base: Base) -> Array:
-    """Those of its last candidate, on a base, (n, d)."""
-    probes = hypothesis.probes(hypothesis.candidates[-1])
+    probes = hypothesis.probes(candidate)
     probes[:, : len(base.fit.u)] = base.fit.u
-    return probes
+    errors = misfit.errors(np.concatenate([without[None], probes]))  # a structure alone changes a little
+    changes = errors[1:] - errors[0]
+    small = np.linalg.norm(changes.reshape(len(probes), -1), axis=1) < _LEAST_CHANGE
+    if not small.any():
+        return probes, changes
+    amounts, larger = hypothesis.amounts(candidate), probes[small]
+    larger[:, amounts] += (_LARGER - 1) * (larger - without)[:, amounts]
+    larger = np.clip(larger, hypothesis.low, hypothesis.high)
+    return np.concatenate([probes, larger]), np.concatenate([changes, misfit.errors(larger) - errors[0]])
 
 
-def _screened(hypothesis: Hypothesis, made: Array, base: Base) -> Screened:
+def _screened(hypothesis: Hypothesis, probes: Array, changes: Array, base: Base) -> Screened:
     """What a hypothesis' last candidate would gain if its best probe acted linearly."""
     candidate = hypothesis.candidates[-1]
     amounts, neutral = hypothesis.amounts(candidate), hypothesis.neutral()
     residual, (orthonormal, triangle) = base.fit.residual, base.fit.orthonormal
     found: list[Screened] = []
-    for probe, change_of_data in zip(_probes(hypothesis, base), made, strict=True):
+    for probe, change_of_data in zip(probes, changes, strict=True):
         change = np.concatenate([change_of_data.ravel(), np.zeros(len(base.fit.u))])
         absorbed = orthonormal.T @ change
         direction = change - orthonormal @ absorbed
