@@ -19,9 +19,10 @@ from simopt_envs.gap.motion import motion_of
 from simopt_envs.gap.plain import plain_parameters
 from simopt_envs.gap.recordings import read_windows
 from simopt_envs.gap.refit import Refit, grown
+from simopt_envs.gap.screen import made_by_probes
 from simopt_envs.gap.search import Search
 from simopt_envs.gap.selection import is_there, score_of
-from simopt_envs.gap.thresholds import LARGE
+from simopt_envs.gap.thresholds import EVIDENCE, LARGE, PROBED_LARGER
 from simopt_envs.physics.effects import EFFECTS
 
 pytestmark = needs_effects
@@ -31,6 +32,7 @@ DRY = Candidate(EFFECTS["coulomb_friction"], "joint:elbow")
 COGGING = Candidate(EFFECTS["cogging"], "joint:elbow")
 PUSH = Candidate(EFFECTS["actuator_bias"], "actuator:shoulder")
 LIMIT = Candidate(EFFECTS["actuator_saturation"], "actuator:elbow")
+PLAY = Candidate(EFFECTS["backlash"], "joint:elbow")
 PEAKED = Candidate(EFFECTS["stribeck_friction"], "joint:elbow")
 ONE_SIDED = Candidate(EFFECTS["asymmetric_friction"], "joint:elbow")
 
@@ -39,6 +41,21 @@ def _search(forces: Law, candidates: Sequence[Candidate], limit: float | None = 
     plain = plain_parameters(mujoco.MjSpec.from_string(MODEL))
     recordings = record(forces, np.random.default_rng(0), limit=limit)
     return Search(plain, read_windows(plain.model, recordings), motion_of(plain.model, recordings), candidates)
+
+
+def test_only_probes_that_hardly_show_are_tried_larger_too():
+    """Of plays of several sizes, those that change all errors together by too little to earn a name."""
+    search = _search(lambda q, v: np.zeros(2), (PLAY,))
+    hypothesis = Hypothesis(search.plain, (PLAY,), search.motion)
+    given = hypothesis.probes(PLAY)
+    probes, changes = made_by_probes(hypothesis, search.base(), search.data.fitted, 1)
+    changed = np.linalg.norm(changes.reshape(len(probes), -1), axis=1)
+    small = changed[: len(given)] < np.sqrt(2 * EVIDENCE)
+    assert 0 < small.sum() < len(given)
+    amounts = hypothesis.amounts(PLAY)
+    np.testing.assert_allclose(probes[: len(given), amounts], given[:, amounts])
+    np.testing.assert_allclose(probes[len(given) :, amounts], PROBED_LARGER * given[small][:, amounts])
+    assert np.all(changed[len(given) :] > 2 * changed[: len(given)][small])
 
 
 def test_a_fit_does_not_end_in_the_period_that_its_best_start_is_near():

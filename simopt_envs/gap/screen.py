@@ -10,7 +10,7 @@ import numpy as np
 from simopt_envs.engine import Engine, counted
 from simopt_envs.gap.fit import Misfit
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
-from simopt_envs.gap.thresholds import EVIDENCE
+from simopt_envs.gap.thresholds import EVIDENCE, PROBED_LARGER
 from simopt_envs.gap.trial import Base
 from simopt_envs.measured.windows import Windows
 from simopt_envs.physics.parameters import Array
@@ -19,7 +19,6 @@ _STEPS = np.array([1.0, 0.3, 0.1, 0.03])  # shares of the screen's step that a f
 _WORTH_A_START = 0.2  # share of the best probe's gain at which a fit may start from another one
 _FURTHEST = 20.0  # probes that the screen's step may be long
 _LEAST_CHANGE = np.sqrt(2 * EVIDENCE)  # of the errors together, in standard deviations, that can earn so many nats
-_LARGER = 10.0  # times the size of a probe that changes less
 
 
 @dataclass(frozen=True)
@@ -59,13 +58,13 @@ def screen(
     lacking = [c for c in candidates if c not in effects]
     hypotheses = [Hypothesis(plain, [*effects, c], motion) for c in lacking]
     shared = base, windows, engine.num_threads
-    made = engine.map(_made_by_probes, hypotheses, shared, counted(progress, len(lacking)))
+    made = engine.map(made_by_probes, hypotheses, shared, counted(progress, len(lacking)))
     found = [_screened(hypothesis, *one, base) for hypothesis, one in zip(hypotheses, made, strict=True)]
     price = 0.5 * np.log(base.fit.errors.size)
     return sorted(found, key=lambda s: price * len(s.hypothesis.columns[s.candidate]) - s.gain)
 
 
-def _made_by_probes(hypothesis: Hypothesis, base: Base, windows: Windows, num_threads: int) -> tuple[Array, Array]:
+def made_by_probes(hypothesis: Hypothesis, base: Base, windows: Windows, num_threads: int) -> tuple[Array, Array]:
     """The probes (n, d) of a hypothesis' last candidate, and what each changes in a base's errors, (n, w, S, c).
 
     Of one that changes less than an effect must to earn its name, a larger one is a probe, too: where things touch,
@@ -83,7 +82,7 @@ def _made_by_probes(hypothesis: Hypothesis, base: Base, windows: Windows, num_th
     if not small.any():
         return probes, changes
     amounts, larger = hypothesis.amounts(candidate), probes[small]
-    larger[:, amounts] += (_LARGER - 1) * (larger - without)[:, amounts]
+    larger[:, amounts] += (PROBED_LARGER - 1) * (larger - without)[:, amounts]
     larger = np.clip(larger, hypothesis.low, hypothesis.high)
     return np.concatenate([probes, larger]), np.concatenate([changes, misfit.errors(larger) - errors[0]])
 

@@ -37,6 +37,9 @@ the windows fitted are and held-out ones do not speak against it."""
 EXPLAINED = 1.25
 """Mean square of the whitened errors up to which a model counts as right; noise alone leaves 1."""
 
+PROBED_LARGER = 10.0
+"""Times the size of a probe that is tried, too, where a probe changes the errors by too little to earn ``EVIDENCE``."""
+
 SIMPLER = 5.0
 """Nats by which a candidate with more parameters, whose price is paid, must win over one with fewer; or, where that is
 more, the share ``FURTHER`` of what it gains on held-out data, but no more than what it leaves there."""
