@@ -20,7 +20,8 @@ all windows, not by those fitted alone (one case), and the interval may hold wha
 case). ``FARTHEST`` is new since seeds 17000 had (four cases), and ``LEAST_LEFT`` since seeds 18000 had; until then long
 windows were whole recordings or none, and a threshold more asked that starts are forgotten in them.
 ``LEFT_SHARE`` is new since seeds 22000 had been run (one case). Since then, too, outliers are left out (two cases), and
-held-out windows need only not speak against what those fitted show by ``EVIDENCE`` alone (one case).
+held-out windows need only not speak against what those fitted show by ``EVIDENCE`` alone (one case). ``PROBED_LARGER``
+is new since seeds 23000 had been run (one case).
 
 What fitted values must be for an effect's name to fit them is with the effects (``Effect.is_itself``): that a cogging
 shows a whole period is asked since seeds 20000 had been run (one case, and one of the gap demonstration).
