@@ -13,7 +13,7 @@ from gap_plant import MODEL, Law, record
 
 from simopt_envs.gap import fit as fits
 from simopt_envs.gap.explanation import ranked
-from simopt_envs.gap.fit import Misfit
+from simopt_envs.gap.fit import CONFIRMING, DIFFERENCES, Misfit
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
 from simopt_envs.gap.motion import motion_of
 from simopt_envs.gap.plain import plain_parameters
@@ -185,6 +185,21 @@ def test_friction_that_turns_out_alike_in_both_directions_gives_way_to_coulomb_f
     assert {*final.hypothesis.candidates} == {DRY, SPRING} == {score.candidate for score in effects}
 
 
+@pytest.mark.parametrize(("push", "friction"), [(0.0, 0.0), (2.0, 0.0), (2.0, 0.5)])
+def test_what_did_well_beside_an_effect_that_goes_takes_its_place(push, friction):
+    """Part of a cogging's period is no cogging; a push does as much, and a friction then shows as well. Or nothing."""
+    bent = Candidate(EFFECTS["cogging"], "joint:shoulder")
+    search = _search(lambda q, v: np.array([push, -friction * np.tanh(v[1] / 0.01)]), (bent, PUSH, DRY))
+    stage = search.stage(search.base())
+    hypothesis = Hypothesis(search.plain, (bent,), search.motion)
+    part = {"amplitude": push, "periods": 0.2, "phase": np.pi / 2}
+    start = hypothesis.coordinates(hypothesis.space.values({bent.full_name(n): x for n, x in part.items()}))
+    start[: hypothesis.num_plain] = 0.0
+    final, effects = search._revised(search.base((bent,), start), [stage])
+    expected = {c for c, size in ((PUSH, push), (DRY, friction)) if size}
+    assert {*final.hypothesis.candidates} == expected == {score.candidate for score in effects}
+
+
 @pytest.mark.parametrize("limit", [1.2, 5.0])
 def test_a_limit_is_there_where_it_acts(limit):
     """Of a limit, unlike a friction, there is no amount that could be none; the elbow's drive gives 3 N m at most."""
@@ -194,6 +209,35 @@ def test_a_limit_is_there_where_it_acts(limit):
     start[: hypothesis.num_plain] = 0.0
     base = search.base((LIMIT,), start)
     assert is_there(base.hypothesis, LIMIT, *base.by_all(search.data)) == (limit < 3)
+
+
+@pytest.mark.parametrize("limit", [0.4, 1.0, 1.2, 1.5])
+def test_what_no_motion_tells_is_known_as_well_as_the_priors_say(limit):
+    """Of all masses, dampings, servos and a limit, each larger by the same factor, though noise is small."""
+    search = _search(lambda q, v: np.zeros(2), (LIMIT,), limit)
+    hypothesis = Hypothesis(search.plain, (LIMIT,), search.motion)
+    start = hypothesis.coordinates(hypothesis.space.values({LIMIT.full_name("limit"): limit}))
+    start[: hypothesis.num_plain] = 0.0
+    misfit = Misfit(hypothesis, search.data.fitted)
+    misfit = misfit.with_noise(misfit.noise_at(start, np.full(5, 1e-4)))
+
+    def larger(factor: float) -> np.ndarray:
+        xi = hypothesis.xi(start[None])[0]
+        for i, (kind, _, place) in enumerate(name.partition(".") for name in hypothesis.space.names):
+            if kind == "armature":  # what is added to that of the model
+                xi[i] += (factor - 1) * search.plain.model.joint(place).armature[0]
+            elif kind not in ("command_latency", "integration_lead"):
+                xi[i] *= factor
+        return hypothesis.coordinates(xi)
+
+    errors = misfit.errors(np.array([start, larger(1.05)]))
+    np.testing.assert_allclose(errors[0], errors[1], atol=1e-6)
+    along = larger(1.001) - larger(0.999)
+    by_priors = abs(along[-1]) / np.linalg.norm(along / hypothesis.prior_std)
+    own, *others = (misfit.jacobian(start, difference=d) for d in (DIFFERENCES[-1], *CONFIRMING))
+    fit = fits.Fit(start, np.zeros(errors[0].shape), own, hypothesis.prior_std, np.zeros(len(errors[0])))
+    assert np.sqrt(fit.variance(others)[-1]) == pytest.approx(by_priors, rel=0.1)
+    assert np.sqrt(fit.variance([own])[-1]) < 0.5 * by_priors  # by derivatives that nothing confirms
 
 
 def test_a_peak_of_friction_is_looked_for_from_where_the_fit_of_friction_without_one_ended():

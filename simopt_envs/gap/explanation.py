@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from simopt_envs.gap.hypothesis import Candidate
 from simopt_envs.gap.screen import Screened
 from simopt_envs.gap.selection import Score, score_of, worth_of
-from simopt_envs.gap.thresholds import EVIDENCE
+from simopt_envs.gap.thresholds import EVIDENCE, EXPLAINED
 from simopt_envs.gap.trial import Base, Data, Trial
 
 
@@ -39,6 +39,11 @@ class Stage:
         trials = {candidate: trial.held_against(rows) for candidate, trial in self.trials.items()}
         return ranked(self.base.held_against(rows), self.screened, trials)
 
+    @property
+    def promising(self) -> set[Candidate]:
+        """The candidates that earn as many nats as are evidence."""
+        return {score.candidate for score in self.scores if score.total > EVIDENCE}
+
     def rivals(self, effect: Candidate) -> set[Candidate]:
         """The other candidates that do nearly as much as the one that was taken, or more; none if it was not fitted."""
         total = {score.candidate: score.total for score in self.scores}
@@ -62,6 +67,22 @@ def ranked(base: Base, screened: Sequence[Screened], trials: Mapping[Candidate, 
 def stage_of(stages: Sequence[Stage], effect: Candidate) -> Stage:
     """The stage at whose end an effect was taken: the last one without it."""
     return [stage for stage in stages if effect not in stage.base.hypothesis.candidates][-1]
+
+
+def rivals_of(effect: Candidate, stays: bool, without: Base, stages: Sequence[Stage]) -> set[Candidate]:
+    """What an effect is held against beside others or, if it goes and these alone are not enough, what may follow it.
+
+    Beside no others, the stage at whose end it was taken held it against all.
+
+    Args:
+        effect: that was taken.
+        stays: whether it does.
+        without: the base with the others.
+        stages: so far.
+    """
+    if stays:
+        return stage_of(stages, effect).rivals(effect) if without.hypothesis.candidates else set()
+    return set().union(*(stage.promising for stage in stages)) if without.excess > EXPLAINED - 1 else set()
 
 
 @dataclass(frozen=True)

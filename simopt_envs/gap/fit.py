@@ -23,6 +23,10 @@ from simopt_envs.physics.parameters import Array
 # Of a unit of u, to both sides, one after another. Contacts and dry friction make predictions kink: derivatives over
 # less tell of one kink and lead a fit astray, those over much lead it across them and past where laws bend.
 DIFFERENCES = (1.0, 0.3, 0.1)
+CONFIRMING = (0.3, 0.01)
+"""The same, over which derivatives must confirm what a fit says that it knows: coarse ones, as fine ones are rough
+where things touch, and elsewhere fine ones, as coarse ones are bent."""
+_ROUGH = 3.0  # times as unlike as another
 _KINK = 6.0  # medians: four standard deviations
 _LEAST_GAIN = 1e-4  # share of the loss that a step takes away, below which a fit has arrived
 _BEYOND = np.geomspace(3.0, 3000.0, 7)  # standard deviations from where a fit ended, at which it looks again
@@ -71,14 +75,15 @@ class Fit:
         orthonormal, triangle = np.linalg.qr(self.rows)
         return orthonormal, triangle
 
-    def variance(self, other: Array, mean_square: float = 1.0, parts: int = 1) -> Array:
+    def variance(self, others: Sequence[Array], mean_square: float = 1.0, parts: int = 1) -> Array:
         """Of u, (d,): of the Gauss-Newton Hessian or, where that is more, of how far stretches of data pull it apart.
 
         The latter (White 1980, clustered by stretch) holds where errors are not what their noise says: those that a
         wrong law, or a start, leaves in a stretch go together.
 
         Args:
-            other: the Jacobian over other differences; what it does not confirm of this one tells nothing.
+            others: Jacobians over other differences; what one of them denies of this one tells nothing, but for those
+                that differ by much more than another does.
             mean_square: of whitened errors.
             parts: stretches in a window.
         """
@@ -87,13 +92,21 @@ class Fit:
         jacobian = self.jacobian.reshape(*self.errors.shape, len(self.u))
         pulls = by_part(np.einsum("wscd,wsc->wsd", jacobian, self.errors), parts)
         apart = pulls.T @ pulls * len(pulls) / max(len(pulls) - 1, 1) + np.diag(self.prior_std**-2.0)
-        return np.maximum(mean_square * np.diag(self._confirmed(other)), np.diag(inverse @ apart @ inverse))
+        unlike = [self._unlike(other) for other in others]
+        asked = [other for other, much in zip(others, unlike, strict=True) if much <= _ROUGH * min(unlike)]
+        confirmed = [mean_square * np.diag(self._confirmed(other)) for other in asked]
+        return np.max([*confirmed, np.diag(inverse @ apart @ inverse)], axis=0)
+
+    def _unlike(self, other: Array) -> float:
+        """How much a Jacobian over other differences differs, in coordinates in which all is known alike."""
+        return float(np.linalg.norm(np.linalg.solve(self.orthonormal[1].T, (other - self.jacobian).T)))
 
     def _confirmed(self, other: Array) -> Array:
         """Covariance of u, (d, d), if the data tell only what the Jacobian over other differences agrees on.
 
-        Contacts and dry friction make derivatives rough. By that alone the columns of two parameters that are one in
-        the data differ, and either would seem to be known; but over other differences they differ in another way.
+        Contacts and dry friction make derivatives rough, and what is not straight bends them. By that alone the columns
+        of parameters that are one in the data differ, and each would seem to be known; but over other differences they
+        differ in another way.
         """
         whiten = np.linalg.inv(self.orthonormal[1]).T  # in the coordinates it leads to, all is known to a variance of 1
         both = self.jacobian.T @ other

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,8 +12,10 @@ from simopt_envs.adaptation.checkpoint import Result
 from simopt_envs.gap.fit import DIFFERENCES, Misfit, fit
 from simopt_envs.gap.hypothesis import Candidate
 from simopt_envs.gap.large import SECONDS, best_of_each, of_some_size
+from simopt_envs.gap.plain import SPEAKS_FOR
 from simopt_envs.gap.predictive import HeldOut
 from simopt_envs.gap.screen import Screened
+from simopt_envs.gap.thresholds import FAR
 from simopt_envs.gap.trial import Base, Trial
 from simopt_envs.measured.windows import Windows
 from simopt_envs.physics.parameters import Array
@@ -108,3 +110,18 @@ def grown(screened: Screened, trials: Mapping[Candidate, Trial]) -> tuple[Array,
     if smaller is None:
         return ()
     return tuple(screened.hypothesis.grown(trials[smaller].hypothesis, trials[smaller].fit.u))
+
+
+def spoken_for(base: Base, candidates: Sequence[Candidate]) -> dict[Candidate, Array]:
+    """The candidates that plain parameters far outside their priors speak for; a linear screen cannot tell them.
+
+    Each with the base's coordinates (d,), but those parameters at their priors' means.
+    """
+    plain = base.hypothesis.num_plain
+    starts: dict[Candidate, Array] = {}
+    for i in np.flatnonzero(np.abs(base.fit.u[:plain]) > FAR):
+        kind, _, name = base.hypothesis.space.names[i].partition(".")
+        for c in candidates:
+            if c.effect.name == SPEAKS_FOR.get(kind) and c.place.endswith(name):
+                starts.setdefault(c, base.fit.u.copy())[i] = 0.0
+    return starts

@@ -12,7 +12,7 @@ import numpy as np
 from simopt_envs.adaptation.checkpoint import Result
 from simopt_envs.adaptation.fitting import Noise
 from simopt_envs.engine import Engine, ThreadEngine, counted
-from simopt_envs.gap.explanation import Explanation, Stage, ranked, stage_of
+from simopt_envs.gap.explanation import Explanation, Stage, ranked, rivals_of
 from simopt_envs.gap.fit import DIFFERENCES, Fit, Misfit, fit
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
 from simopt_envs.gap.kept import kept_fits, key_of
@@ -20,13 +20,12 @@ from simopt_envs.gap.large import SECONDS, nearest_size, of_several_effects
 from simopt_envs.gap.outliers import without_outliers
 from simopt_envs.gap.plain import SPEAKS_FOR, Plain
 from simopt_envs.gap.predictive import HeldOut
-from simopt_envs.gap.refit import ITERATIONS, Refit, extended, fitted, grown
+from simopt_envs.gap.refit import ITERATIONS, Refit, extended, fitted, grown, spoken_for
 from simopt_envs.gap.screen import Screened, screen
 from simopt_envs.gap.selection import Score, chosen, is_there, may_be_itself, score_of, tolerance_of, worth_of
 from simopt_envs.gap.thresholds import (
     EVIDENCE,
     EVIDENCE_EACH,
-    FAR,
     LARGE,
     LARGE_REFITTED,
     MOST_EFFECTS,
@@ -94,16 +93,22 @@ class Search:
         self._tolerance = tolerance_of(min((score.trial for score in stage.scores), key=lambda trial: trial.excess))
         if np.any(self._tolerance > 1):  # only now it is known that nothing comes near the sensors' noise
             stage = self.stage(self.base(start=self._led_to(stage)))
-        stages = [self._polished(stage)]
-        null = base = stages[0].base
-        while (best := chosen(null, base, stages[-1].scores)) is not None:
+        stages: list[Stage] = []
+        final, effects = self._revised(self._grown(stages, stage), stages)
+        return Explanation(stages[0].base, final, effects, tuple(stages), self.data)
+
+    def _grown(self, stages: list[Stage], stage: Stage, dropped: frozenset[Candidate] = frozenset()) -> Base:
+        """A stage's base with effects added while they earn it, but for those that were dropped; stages are noted."""
+        while True:
+            stage = self._polished(stage)
+            stages.append(replace(stage, scores=tuple(s for s in stage.scores if s.candidate not in dropped)))
+            best = chosen(stages[0].base, stage.base, stages[-1].scores)
+            if best is None:
+                return stage.base
             base = self._contested(stages, self._sharpened(best.trial), best.candidate)
             if len(base.hypothesis.candidates) == min(MOST_EFFECTS, len(self.candidates)):
-                break
-            stages.append(self._polished(self.stage(base)))
-            base = stages[-1].base
-        final, effects = self._revised(base, stages)
-        return Explanation(null, final, effects, tuple(stages), self.data)
+                return base
+            stage = self.stage(base)
 
     def _in_longer_windows(self, base: Base) -> Base:
         """A base fitted to the longest windows that it predicts, and of which, fitted, it leaves no large error.
@@ -193,7 +198,7 @@ class Search:
         """
         screened = self._screened(base)
         done = {} if look is None else look.trials
-        wanted = [*self._spoken_for(base), *self._large(base)]
+        wanted = [*spoken_for(base, self.candidates), *self._large(base)]
         likely = [s.candidate for s in screened[:REFITTED_AT_MOST] if s.gain > EVIDENCE_EACH]
         promising = screened[:REFITTED] + [s for s in screened[REFITTED:] if s.candidate in (*likely, *wanted)]
         refits = self._refits(base, [one for one in promising if one.candidate not in done])
@@ -202,7 +207,7 @@ class Search:
 
     def _refits(self, base: Base, promising: Sequence[Screened]) -> list[Refit]:
         """From where candidates are fitted: afar, too, where the base is far from the data or its priors."""
-        far: dict[Candidate, tuple[Array, ...]] = {c: (start,) for c, start in self._spoken_for(base).items()}
+        far: dict[Candidate, tuple[Array, ...]] = {c: (u,) for c, u in spoken_for(base, self.candidates).items()}
         for candidate in (one.candidate for one in promising):
             if base.excess > LARGE or (base.strained and candidate.effect.name in SPEAKS_FOR.values()):
                 far[candidate] = (*far.get(candidate, ()), afresh(base))
@@ -330,20 +335,6 @@ class Search:
         """A fit's name; of the noise of starts, what tells one from another is enough."""
         return key_of(hypothesis, np.array(self.data.fitted.measured.shape), noise.scale, noise.shrink, *given)
 
-    def _spoken_for(self, base: Base) -> dict[Candidate, Array]:
-        """The candidates that plain parameters far outside their priors speak for; a linear screen cannot tell them.
-
-        Each with the base's coordinates (d,), but those parameters at their priors' means.
-        """
-        plain = base.hypothesis.num_plain
-        starts: dict[Candidate, Array] = {}
-        for i in np.flatnonzero(np.abs(base.fit.u[:plain]) > FAR):
-            kind, _, name = base.hypothesis.space.names[i].partition(".")
-            for c in self.candidates:
-                if c.effect.name == SPEAKS_FOR.get(kind) and c.place.endswith(name):
-                    starts.setdefault(c, base.fit.u.copy())[i] = 0.0
-        return starts
-
     def _revised(
         self, base: Base, stages: list[Stage], dropped: frozenset[Candidate] = frozenset()
     ) -> tuple[Base, tuple[Score, ...]]:
@@ -352,32 +343,36 @@ class Search:
         With it comes what each earns, most first. With and without are compared in one noise, that of the model with
         all: what uncertain starts leave depends on the model too. An effect whose interval, by all windows, holds "none
         of it" goes as well: the evidence for it is of a few stretches, and others speak against it; so does one that is
-        not what its name means. One of which that holds for what it adds to the effect that it extends gives way to
-        that. What was dropped does not come back.
+        not what its name means. What did well beside it may take its place, and others then be added. One of which that
+        holds for what it adds to the effect that it extends gives way to that. What was dropped does not come back.
         """
         effects, earned = base.hypothesis.candidates, []
         if not effects:
             return base, ()
         hypothesis, (u, spread) = base.hypothesis, base.by_all(self.data)
-        for effect in effects:
+        itself = {effect: may_be_itself(hypothesis, effect, u, spread) for effect in effects}
+        for effect in sorted(effects, key=itself.__getitem__):  # beside what is none, another may only seem needless
             told, smaller = (hypothesis, effect, u, spread), extended(effect, {*self.candidates} - dropped - {*effects})
-            itself = may_be_itself(*told)
-            if smaller is not None and not (itself and is_there(*told, smaller)):
+            if smaller is not None and not (itself[effect] and is_there(*told, smaller)):
                 return self._revised(self._reduced(base, effect, smaller), stages, dropped | {effect})
             without = self._without(base, effect, stages)
             score = score_of(without, effect, base, worth_of(base))
-            if not (score.needed and itself and is_there(*told)):
+            stays = score.needed and itself[effect] and is_there(*told)
+            rivals = rivals_of(effect, stays, without, stages) - dropped - {*effects}
+            if rivals:
+                screened = self._screened(without)
+                trials = self.trials(without, [Refit(s) for s in screened if s.candidate in rivals])
+                trials = self._in_full(without, screened, trials) | ({effect: base} if stays else {})
+                stages.append(ranked(without, screened, trials))
+                best = chosen(stages[0].base, without, stages[-1].scores)
+                if best is not None and best.candidate != effect:
+                    base, dropped = self._sharpened(best.trial), dropped | {effect}
+                    if not stays:
+                        base = self._grown(stages, self.stage(base), dropped)
+                    return self._revised(base, stages, dropped)
+            if not stays:
                 return self._revised(self.base(without.hypothesis.candidates, without.fit.u), stages, dropped)
             earned.append(score)
-            rivals = stage_of(stages, effect).rivals(effect) - dropped - {*effects} if len(effects) > 1 else ()
-            if not rivals:
-                continue
-            screened = self._screened(without)
-            trials = self.trials(without, [Refit(s) for s in screened if s.candidate in rivals])
-            stages.append(ranked(without, screened, {**self._in_full(without, screened, trials), effect: base}))
-            best = chosen(stages[0].base, without, stages[-1].scores)
-            if best is not None and best.candidate != effect:
-                return self._revised(self._sharpened(best.trial), stages, dropped | {effect})
         return base, tuple(sorted(earned, key=lambda score: -score.total))
 
     def _without(self, base: Base, effect: Candidate, stages: Sequence[Stage]) -> Base:

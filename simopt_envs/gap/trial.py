@@ -11,7 +11,7 @@ from scipy.optimize import lsq_linear
 from scipy.stats import chi2
 
 from simopt_envs.adaptation.fitting import Noise
-from simopt_envs.gap.fit import DIFFERENCES, Fit, Misfit
+from simopt_envs.gap.fit import CONFIRMING, Fit, Misfit
 from simopt_envs.gap.hypothesis import Hypothesis
 from simopt_envs.gap.predictive import HeldOut, precision
 from simopt_envs.gap.thresholds import EXPLAINED, FAR, WINDOW
@@ -164,7 +164,7 @@ class Base(Trial):
 
     def spread(self, data: Data) -> Array:
         """Standard deviation of u, (d,), by the windows that were fitted."""
-        return np.sqrt(self.fit.variance(self._other(data.fitted, self.noise), self._left, data.parts))
+        return np.sqrt(self.fit.variance(self._others(data.fitted, self.noise), self._left, data.parts))
 
     def by_all(self, data: Data) -> tuple[Array, Array]:
         """u by the windows fitted and those held out together, to first order from the fit, and its spread, (d,)."""
@@ -172,18 +172,19 @@ class Base(Trial):
         errors = np.concatenate([self.fit.errors, weight * self.held_out.errors])
         of_held_out = weight[:, None] * self.held_out.jacobian
         jacobian = np.concatenate([self.fit.jacobian, of_held_out.reshape(-1, len(self.fit.u))])
-        other = [self._other(data.fitted, self.noise), self._other(data.held_out, self.held_out_noise)]
+        both = (data.fitted, self.noise), (data.held_out, self.held_out_noise)
+        others = [np.concatenate(some) for some in zip(*(self._others(*one) for one in both), strict=True)]
         fit = replace(self.fit, errors=errors, jacobian=jacobian)
         u = fit.u + lsq_linear(fit.rows, -fit.residual, self.within, method="bvls").x
         stepped = replace(fit, u=u, errors=errors + (jacobian @ (u - fit.u)).reshape(errors.shape))
-        return u, np.sqrt(stepped.variance(np.concatenate(other), self._left, data.parts))
+        return u, np.sqrt(stepped.variance(others, self._left, data.parts))
 
     @property
     def _left(self) -> float:
         """Mean square of the whitened held-out errors, at least that of noise."""
         return max(1.0, float(np.mean((self.held_out.errors / self.tolerance) ** 2)))
 
-    def _other(self, windows: Windows, noise: Noise) -> Array:
-        """The Jacobian on some windows over other differences than the fit's."""
+    def _others(self, windows: Windows, noise: Noise) -> list[Array]:
+        """Jacobians on some windows over other differences than the fit's."""
         misfit = Misfit(self.hypothesis, windows).with_noise(noise)
-        return misfit.jacobian(self.fit.u, difference=DIFFERENCES[1])
+        return [misfit.jacobian(self.fit.u, difference=difference) for difference in CONFIRMING]
