@@ -185,7 +185,7 @@ def test_friction_that_turns_out_alike_in_both_directions_gives_way_to_coulomb_f
     assert {*final.hypothesis.candidates} == {DRY, SPRING} == {score.candidate for score in effects}
 
 
-@pytest.mark.parametrize(("push", "friction"), [(0.0, 0.0), (2.0, 0.0), (2.0, 0.5)])
+@pytest.mark.parametrize(("push", "friction"), [(0.0, 0.0), (2.0, 0.5)])
 def test_what_did_well_beside_an_effect_that_goes_takes_its_place(push, friction):
     """Part of a cogging's period is no cogging; a push does as much, and a friction then shows as well. Or nothing."""
     bent = Candidate(EFFECTS["cogging"], "joint:shoulder")
