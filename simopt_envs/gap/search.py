@@ -367,7 +367,7 @@ class Search:
                 best = chosen(stages[0].base, without, stages[-1].scores)
                 if best is not None and best.candidate != effect:
                     base, dropped = self._sharpened(best.trial), dropped | {effect}
-                    if not stays:
+                    if not stays and len(base.hypothesis.candidates) < MOST_EFFECTS:
                         base = self._grown(stages, self.stage(base), dropped)
                     return self._revised(base, stages, dropped)
             if not stays:
