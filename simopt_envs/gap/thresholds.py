@@ -21,7 +21,8 @@ case). ``FARTHEST`` is new since seeds 17000 had (four cases), and ``LEAST_LEFT`
 windows were whole recordings or none, and a threshold more asked that starts are forgotten in them.
 ``LEFT_SHARE`` is new since seeds 22000 had been run (one case). Since then, too, outliers are left out (two cases), and
 held-out windows need only not speak against what those fitted show by ``EVIDENCE`` alone (one case). ``PROBED_LARGER``
-is new since seeds 23000 had been run (one case).
+is new since seeds 23000 had been run (one case). Since seeds 24000 had, finer derivatives confirm intervals,
+too, where they are not rough (``gap/fit.py``; one kind of case, in three splits).
 
 What fitted values must be for an effect's name to fit them is with the effects (``Effect.is_itself``): that a cogging
 shows a whole period is asked since seeds 20000 had been run (one case, and one of the gap demonstration).
