@@ -351,4 +351,4 @@ def test_sensor_effects_write_columns(effect, field, nominal):
     assert columns["sensor:rate"] == ["sensor/rate"]
     assert columns["sensor:acceleration"] == [f"sensor/acceleration/{i}" for i in range(3)]
     assert columns["joint:elbow"] == ([] if effect == "sensor_bias" else ["qpos/elbow", "qvel/elbow"])
-    assert columns.get("site:tip", []) == ([f"site/tip/{a}" for a in "xyz"] if effect == "sensor_delay" else [])
+    assert columns.get("site:tip", []) == ([] if effect == "sensor_bias" else [f"site/tip/{a}" for a in "xyz"])

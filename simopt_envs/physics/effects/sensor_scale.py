@@ -6,7 +6,7 @@ import mujoco
 
 from simopt_envs.physics.effects.effect import Effect, Motion
 from simopt_envs.physics.effects.joints import scalar_joints
-from simopt_envs.physics.effects.readings import columns, sensors
+from simopt_envs.physics.effects.readings import columns, sensors, sites
 from simopt_envs.physics.parameters import Parameter, Write
 
 
@@ -19,7 +19,7 @@ class SensorScale(Effect):
 
     def places(self, model: mujoco.MjModel) -> tuple[str, ...]:
         """See :meth:`Effect.places`."""
-        return scalar_joints(model) + sensors(model)
+        return scalar_joints(model) + sensors(model) + sites(model)
 
     def parameters(self, model: mujoco.MjModel, place: str) -> tuple[Parameter, ...]:
         """See :meth:`Effect.parameters`."""
