@@ -12,6 +12,7 @@ from conftest import needs_effects
 from gap_plant import MODEL, Law, record
 
 from simopt_envs.gap import fit as fits
+from simopt_envs.gap import search as searches
 from simopt_envs.gap.explanation import ranked
 from simopt_envs.gap.fit import CONFIRMING, DIFFERENCES, Misfit
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
@@ -19,7 +20,7 @@ from simopt_envs.gap.motion import motion_of
 from simopt_envs.gap.plain import plain_parameters
 from simopt_envs.gap.recordings import read_windows
 from simopt_envs.gap.refit import Refit, grown
-from simopt_envs.gap.screen import made_by_probes
+from simopt_envs.gap.screen import made_by_probes, screen
 from simopt_envs.gap.search import Search
 from simopt_envs.gap.selection import is_there, score_of
 from simopt_envs.gap.thresholds import EVIDENCE, LARGE, PROBED_LARGER
@@ -56,6 +57,23 @@ def test_only_probes_that_hardly_show_are_tried_larger_too():
     np.testing.assert_allclose(probes[: len(given), amounts], given[:, amounts])
     np.testing.assert_allclose(probes[len(given) :, amounts], PROBED_LARGER * given[small][:, amounts])
     assert np.all(changed[len(given) :] > 2 * changed[: len(given)][small])
+
+
+@pytest.mark.parametrize("size", [0.0, 0.2])
+def test_what_takes_much_of_held_out_errors_is_fitted_wherever_the_screen_has_it(monkeypatch, size):
+    """Dry friction, which the screen is made to have last; without friction the first candidate alone is fitted."""
+    monkeypatch.setattr(searches, "REFITTED", 1)
+    monkeypatch.setattr(searches, "REFITTED_AT_MOST", 1)
+    monkeypatch.setattr(searches, "screen", lambda *given: screen(*given)[::-1])
+    search = _search(lambda q, v: np.array([0.0, -size * np.tanh(v[1] / 0.01)]), (SPRING, COGGING, PUSH, DRY))
+    base = search.base()
+    assert base.excess < LARGE  # or it would be fitted for that
+    stage = search.stage(base)
+    assert (DRY in stage.trials) == (size > 0)
+    if size:
+        assert stage.screened[-1].candidate == DRY
+    else:
+        assert set(stage.trials) == {stage.screened[0].candidate}
 
 
 def test_a_fit_does_not_end_in_the_period_that_its_best_start_is_near():

@@ -10,7 +10,7 @@ import numpy as np
 from simopt_envs.engine import Engine, counted
 from simopt_envs.gap.fit import Misfit
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
-from simopt_envs.gap.thresholds import EVIDENCE, PROBED_LARGER
+from simopt_envs.gap.thresholds import EVIDENCE, FORETELLING, FORETOLD, PROBED_LARGER
 from simopt_envs.gap.trial import Base
 from simopt_envs.measured.windows import Windows
 from simopt_envs.physics.parameters import Array
@@ -85,6 +85,23 @@ def made_by_probes(hypothesis: Hypothesis, base: Base, windows: Windows, num_thr
     larger[:, amounts] += (PROBED_LARGER - 1) * (larger - without)[:, amounts]
     larger = np.clip(larger, hypothesis.low, hypothesis.high)
     return np.concatenate([probes, larger]), np.concatenate([changes, misfit.errors(larger) - errors[0]])
+
+
+def foretelling(base: Base, screened: Sequence[Screened], windows: Windows, engine: Engine) -> list[Candidate]:
+    """Those that take the most from what a base leaves of the windows held out, at the screen's steps.
+
+    What was fitted may hardly go where an effect acts, so that the screen alone would not have it fitted.
+    """
+    some = [one for one in screened if one.gain > FORETOLD]
+    left = np.array(engine.map(_least_left, some, (base, windows, engine.num_threads)))
+    gains = 0.5 * (np.sum((base.held_out.errors / base.tolerance) ** 2) - left)
+    return [some[i].candidate for i in np.argsort(-gains, kind="stable")[:FORETELLING] if gains[i] > EVIDENCE]
+
+
+def _least_left(screened: Screened, base: Base, windows: Windows, num_threads: int) -> float:
+    """The least sum of squared errors of windows held out at the screen's whole step, of each promising probe."""
+    misfit = Misfit(screened.hypothesis, windows, num_threads).with_noise(base.held_out_noise)
+    return float(np.sum(misfit.errors(screened.starts[:, 0]) ** 2, axis=(1, 2, 3)).min())
 
 
 def _screened(hypothesis: Hypothesis, probes: Array, changes: Array, base: Base) -> Screened:

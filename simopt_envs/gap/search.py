@@ -21,7 +21,7 @@ from simopt_envs.gap.outliers import without_outliers
 from simopt_envs.gap.plain import SPEAKS_FOR, Plain
 from simopt_envs.gap.predictive import HeldOut
 from simopt_envs.gap.refit import ITERATIONS, Refit, extended, fitted, grown, spoken_for
-from simopt_envs.gap.screen import Screened, screen
+from simopt_envs.gap.screen import Screened, foretelling, screen
 from simopt_envs.gap.selection import Score, chosen, is_there, may_be_itself, score_of, tolerance_of, worth_of
 from simopt_envs.gap.thresholds import (
     EVIDENCE,
@@ -192,15 +192,16 @@ class Search:
         return self._without_wild(ranked(base, screened, self._in_full(base, screened, halfway.trials)))
 
     def stage(self, base: Base, look: Stage | None = None, before: Stage | None = None) -> Stage:
-        """Screen all candidates, and fit the best, but those that a look from the same base has fitted.
+        """Screen all candidates, and fit the best, by what was held out too, but those that a look there has fitted.
 
         The best of a stage before, from another fit of the base, are fitted from where they ended there, too.
         """
         screened = self._screened(base)
         done = {} if look is None else look.trials
         wanted = [*spoken_for(base, self.candidates), *self._large(base)]
-        likely = [s.candidate for s in screened[:REFITTED_AT_MOST] if s.gain > EVIDENCE_EACH]
-        promising = screened[:REFITTED] + [s for s in screened[REFITTED:] if s.candidate in (*likely, *wanted)]
+        wanted += [s.candidate for s in screened[:REFITTED_AT_MOST] if s.gain > EVIDENCE_EACH]
+        wanted += foretelling(base, screened, self.data.held_out, self._engine)
+        promising = screened[:REFITTED] + [s for s in screened[REFITTED:] if s.candidate in wanted]
         refits = self._refits(base, [one for one in promising if one.candidate not in done])
         trials = done | self.trials(base, refits)
         return ranked(base, screened, self._in_full(base, screened, trials, done, before))
@@ -296,7 +297,7 @@ class Search:
         """
         earlier = {} if before is None else {s.candidate: s.trial for s in before.scores[:_FITTED_IN_FULL]}
         first = [s for s in screened if s.candidate in trials][:1]
-        best = {s.candidate for s in ranked(base, screened, trials).scores[:_FITTED_IN_FULL] if s.total > EVIDENCE}
+        best = {s.candidate for s in ranked(base, screened, trials).scores[:_FITTED_IN_FULL] if s.total > EVIDENCE_EACH}
         best.update(s.candidate for s in first if s.gain > EVIDENCE)
         best.update(c for c in trials if (smaller := extended(c, trials)) in best and smaller not in done)
         refits = []

@@ -22,7 +22,9 @@ windows were whole recordings or none, and a threshold more asked that starts ar
 ``LEFT_SHARE`` is new since seeds 22000 had been run (one case). Since then, too, outliers are left out (two cases), and
 held-out windows need only not speak against what those fitted show by ``EVIDENCE`` alone (one case). ``PROBED_LARGER``
 is new since seeds 23000 had been run (one case). Since seeds 24000 had, finer derivatives confirm intervals,
-too, where they are not rough (``gap/fit.py``; one kind of case, in three splits).
+too, where they are not rough (``gap/fit.py``; one kind of case, in three splits). Since seeds 25000 had, what takes
+much of the held-out errors is fitted wherever the screen has it (``FORETOLD``, ``FORETELLING``; one case), and what
+earns ``EVIDENCE_EACH`` by a coarse fit, not ``EVIDENCE``, is fitted in full (one case).
 
 What fitted values must be for an effect's name to fit them is with the effects (``Effect.is_itself``): that a cogging
 shows a whole period is asked since seeds 20000 had been run (one case, and one of the gap demonstration).
@@ -34,7 +36,8 @@ windows for sizes to be theirs."""
 
 EVIDENCE_EACH = 5.0
 """Nats that it must earn on either, unless those on the windows held out are as many as are asked of both, or those on
-the windows fitted are and held-out ones do not speak against it."""
+the windows fitted are and held-out ones do not speak against it. On both together, from which a coarse fit of it is
+gone on with in full."""
 
 EXPLAINED = 1.25
 """Mean square of the whitened errors up to which a model counts as right; noise alone leaves 1."""
@@ -82,6 +85,12 @@ REFITTED = 6
 
 REFITTED_AT_MOST = 10
 """First candidates of the screen, of which those that gain ``EVIDENCE_EACH`` by it are fitted."""
+
+FORETOLD = 1.0
+"""Nats that a candidate must gain by the screen to be tried on the windows held out, too."""
+
+FORETELLING = 3
+"""Candidates that are fitted for what they take there, if that is ``EVIDENCE``, wherever the screen has them."""
 
 LARGE = 10.0
 """Mean square of the whitened held-out errors, above noise, from which effects are tried at several sizes too."""
