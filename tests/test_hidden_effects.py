@@ -9,7 +9,7 @@ import pytest
 from conftest import needs_effects
 
 from benchmarks.hidden_effects import laws
-from benchmarks.hidden_effects.cases import FIRST_SEED, LEVELS, Case, Hidden, _double, cases, table
+from benchmarks.hidden_effects.cases import FIRST_SEED, LEVELS, Case, Hidden, _are_one, _double, cases, table
 from benchmarks.hidden_effects.catalogue import EFFECTS
 from benchmarks.hidden_effects.detectability import Observability, reduced
 from benchmarks.hidden_effects.generate import column_names, simulate, write_case
@@ -164,6 +164,29 @@ def test_a_joint_has_one_transmission():
     hidden = {(h.effect, h.place) for h in _double(9305, "two_link").hidden}
     assert len(hidden) == 2
     assert not {("backlash", "joint:shoulder"), ("joint_elasticity", "joint:shoulder")} <= hidden
+
+
+def test_a_constant_force_beside_a_spring_is_no_second_effect():
+    """Of this seed the first two drawn are a spring of the carriage and a constant force of its drive."""
+    hidden = _double(25301, "slide_drive").hidden
+    assert len(hidden) == 2
+    assert {h.effect for h in hidden} != {"joint_spring", "actuator_bias"}
+    spring, force, tilt = (
+        Hidden(effect, place, 1.0, True, 10.0, False)
+        for effect, place in (
+            ("joint_spring", "joint:carriage"),
+            ("actuator_bias", "actuator:drive"),
+            ("base_tilt", "body:carriage"),
+        )
+    )
+    assert _are_one("slide_drive", (spring, force))
+    assert _are_one("slide_drive", (tilt, spring))
+    assert not _are_one("slide_drive", (force, tilt))
+    assert not _are_one("slide_drive", (replace(spring, same_form=False), force))
+    elbow, shoulder = (replace(force, place=f"actuator:{joint}") for joint in ("elbow", "shoulder"))
+    spring = replace(spring, place="joint:elbow")
+    assert _are_one("arm3", (elbow, spring))
+    assert not _are_one("arm3", (shoulder, spring))
 
 
 def answer(kind, hidden, verdict, named, value=1.0):
