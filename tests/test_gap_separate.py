@@ -14,10 +14,12 @@ from gap_plant import MODEL
 from simopt_envs.gap import find_gap, plain_parameters
 from simopt_envs.gap.confusion import correlation
 from simopt_envs.gap.excitations import excitations
+from simopt_envs.gap.explanation import Explanation, ranked
 from simopt_envs.gap.hypothesis import Candidate
 from simopt_envs.gap.motion import motion_of
 from simopt_envs.gap.recordings import read_windows
 from simopt_envs.gap.search import Search
+from simopt_envs.gap.separate import _fitted_size
 from simopt_envs.measured import Recording, load_recording
 from simopt_envs.physics.effects import EFFECTS
 from simopt_envs.physics.effects.actuator_bias import ActuatorBias
@@ -174,3 +176,20 @@ def test_nothing_can_be_commanded_without_actuators_or_commands_that_moved():
     assert list(excitations(spec.compile(), recordings, PERIOD)) == []
     still = [replace(r, columns={name: np.full(len(r), 0.3) for name in r.columns}) for r in recordings]
     assert list(excitations(mujoco.MjModel.from_xml_string(MODEL), still, PERIOD)) == []
+
+
+def test_a_partners_size_is_its_own_whatever_order_a_fit_has_its_effects_in(recordings):
+    plain = plain_parameters(mujoco.MjSpec.from_string(MODEL))
+    spring, friction, force = (
+        Candidate(EFFECTS["joint_spring"], "joint:shoulder"),
+        Candidate(EFFECTS["coulomb_friction"], "joint:elbow"),
+        Candidate(EFFECTS["actuator_bias"], "actuator:elbow"),
+    )
+    data = read_windows(plain.model, recordings)
+    search = Search(plain, data, motion_of(plain.model, recordings), (spring, friction, force))
+    without, both = search.base((friction,)), search.base((spring, friction))
+    (screened,) = search._screened(without, (spring,))
+    assert screened.hypothesis.columns[spring] != both.hypothesis.columns[spring]
+    stage = ranked(without, [screened], {spring: both})
+    size = _fitted_size(Explanation(without, both, (), (stage,), data), force, spring)
+    np.testing.assert_array_equal(size, both.fit.u[both.hypothesis.columns[spring]])

@@ -114,13 +114,12 @@ def _is_near(simulated: Array, data: Data, noise: Array) -> NDArray[np.bool_]:
 def _fitted_size(explanation: Explanation, effect: Candidate, partner: Candidate) -> Array:
     """The partner's parameters where it explains the data best in the effect's place, as far as it was fitted, (k,)."""
     stage = stage_of(explanation.stages, effect)
+    trial = next((score.trial for score in stage.scores if score.candidate == partner), None)
+    if trial is not None:  # whose effects may be in another order than the screen's
+        return trial.fit.u[trial.hypothesis.columns[partner]]
     screened = next(s for s in stage.screened if s.candidate == partner)
-    columns = screened.hypothesis.columns[partner]
-    fitted = next((score.trial.fit.u for score in stage.scores if score.candidate == partner), None)
-    if fitted is None:
-        misfit = Misfit(screened.hypothesis, explanation.data.fitted).with_noise(stage.base.noise)
-        fitted = misfit.best(np.concatenate(screened.starts))
-    return fitted[columns]
+    misfit = Misfit(screened.hypothesis, explanation.data.fitted).with_noise(stage.base.noise)
+    return misfit.best(np.concatenate(screened.starts))[screened.hypothesis.columns[partner]]
 
 
 @dataclass(frozen=True)
