@@ -28,7 +28,6 @@ seventeen of the others with ad14e2a; of 21000, four of the tasks with 09074d2 a
 """
 LEVELS = (10.0, 3.0)
 """Magnitudes of single effects, in least detectable ones."""
-_BIAS = "actuator_bias@"
 _OF_TRANSMISSION = {"backlash", "joint_elasticity"}  # a joint has one, which the law of either replaces
 
 
@@ -185,8 +184,9 @@ def _are_one(plant: str, pair: Sequence[Hidden]) -> bool:
         return True
     for spring, other in (pair, pair[::-1]):
         if spring.effect == "joint_spring" and spring.same_form:
-            forces = [name for name in (f"{other.effect}@{other.place}", *_equivalents(plant, other)) if _BIAS in name]
-            joints = [joint_of(plants()[plant], name.split(":")[1]) for name in forces]
+            names = [f"{other.effect}@{other.place}", *_equivalents(plant, other)]
+            drives = [name.split(":")[1] for name in names if name.startswith("actuator_bias@")]
+            joints = [joint_of(plants()[plant], drive) for drive in drives]
             if spring.place.split(":")[1] in joints:
                 return True
     return False
