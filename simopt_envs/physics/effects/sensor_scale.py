@@ -11,7 +11,7 @@ from simopt_envs.physics.parameters import Parameter, Write
 
 
 class SensorScale(Effect):
-    """What is recorded is scaled, positions and velocities alike, or a tracked site; a servo reads its own encoder unscaled."""
+    """What is recorded is scaled, positions and velocities alike, or a site; a servo reads its own encoder unscaled."""
 
     name = "sensor_scale"
     law = "y = s x"
