@@ -19,13 +19,8 @@ from benchmarks.hidden_effects.plants import plants
 Kind = Literal["single", "null", "outside", "double"]
 KINDS: tuple[Kind, ...] = ("single", "null", "outside", "double")
 FIRST_SEED = {"dev": 0, "test": 28000}
-"""Split -> its first seed. Seeds from 1000, 2000, ... 27000 on were earlier test splits, so they count as seen (from
-11000 on they were run with commit 911f320, from 12000 on with 879f229, from 13000 on with 3d1fd0c, from 14000 on
-with e98c874, from 16000 on with a41c792, from 17000 on with 86226d6, from 18000 on with c508b67, from
-19000 on with aa55a10, from 20000 on with 62c9aa6, from 22000 on with f561dd1, from 23000 on with 584dd38, from
-24000 on with 47f038e, from 25000 on with 1c4b8b8, from 26000 on with 310a631, from 27000 on with e4c7ea4; of 15000 a
-few were run: twelve of the tasks with 17789b9, seventeen of the others with ad14e2a; of 21000, four of the tasks with
-09074d2 and twelve of the others with 45ff549).
+"""Split -> its first seed. Seeds from 1000, 2000, ... 27000 on were earlier test splits, so they count as seen; with
+which commit each was run is in ``docs/hidden_effects.md``.
 """
 LEVELS = (10.0, 3.0)
 """Magnitudes of single effects, in least detectable ones."""

@@ -323,7 +323,10 @@ def main() -> None:
     print(f"magnitude error, other form: {_median(errors[False])}")
     removed = [share for a in answers if a.first_right and (share := a.excess_removed()) is not None]
     print(f"share of the excess gap removed: {_median(removed)}")
-    print(f"seconds a case: {_median([float(a.gap['seconds']) for a in answers if 'seconds' in a.gap])}")
+    timed = [(a.label["plant"], float(a.gap["seconds"])) for a in answers if "seconds" in a.gap]
+    print(f"seconds a case: {_median([seconds for _, seconds in timed])}")
+    for plant in dict.fromkeys(plant for plant, _ in timed):
+        print(f"  of {plant}: {_median([seconds for of, seconds in timed if of == plant])}")
     if missing:
         print(f"{len(missing)} of {len(missing) + len(answers)} cases have no gap.json: {', '.join(missing)}")
     if arguments.figure:
