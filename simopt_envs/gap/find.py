@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -28,6 +27,7 @@ from simopt_envs.gap.search import Progress, Search
 from simopt_envs.gap.separate import separate
 from simopt_envs.gap.sizes import of_best_length
 from simopt_envs.gap.trial import Base, Data
+from simopt_envs.gap.unobserved import unobserved
 from simopt_envs.gap.wild_starts import without_wild_starts
 from simopt_envs.measured.mapping import LogMapping
 from simopt_envs.measured.readers import load_recordings
@@ -116,7 +116,7 @@ def read(
     ]
     data = read_windows(start.model, logs, keyframe)
     motion = motion_of(start.model, logs, keyframe)
-    with _silent_warnings():
+    with unobserved():
         data = _without_wild_starts(start, data, motion)
     longer = longer_windows(start.model, data, keyframe)
     return Problem(given, start, data, motion, longer, keyframe, began)
@@ -124,7 +124,7 @@ def read(
 
 def refitted(problem: Problem, progress: Progress = lambda *_: None) -> Base:
     """The model with its plain parameters fitted, which a search begins with."""
-    with _silent_warnings():
+    with unobserved():
         return Search(problem.plain, problem.data, problem.motion, (), progress).base()
 
 
@@ -139,7 +139,7 @@ def solve(
     """What is missing, see :func:`find_gap`; ``null``, if it is there already, is what :func:`refitted` gives."""
     plain, data = problem.plain, problem.data
     seen = tuple(c for effect in effects for c in _places(effect, plain.model) if _shows(c, plain.model, data.fitted))
-    with _silent_warnings():
+    with unobserved():
         search = Search(plain, data, problem.motion, seen, progress, engine, directory, problem.longer, null)
         found = search.run()
         if judge(found) == "partly":
@@ -153,17 +153,6 @@ def _without_wild_starts(plain: Plain, data: Data, motion: Motion) -> Data:
     hypothesis = Hypothesis(plain, (), motion)
     as_given = hypothesis.neutral()
     return without_wild_starts(hypothesis, as_given, data, Misfit(hypothesis, data.fitted).noise_floor(as_given))
-
-
-@contextmanager
-def _silent_warnings() -> Iterator[None]:
-    """Keep MuJoCo from writing of each simulation that runs away: a search tries some that do, and notices itself."""
-    before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda _: None)
-    try:
-        yield
-    finally:
-        mujoco.set_mju_user_warning(before)
 
 
 def _gap(problem: Problem, explanation: Explanation) -> Gap:
