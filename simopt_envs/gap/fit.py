@@ -280,7 +280,7 @@ def fit(
     for difference in differences:
         derivatives = _Derivatives(partial(jacobian, difference=difference))
         x = _descended(x, residual, derivatives, chart, iterations)
-    rows = derivatives(x)
+    rows = derivatives.taken(x)
     for _ in range(_LOOKS if of_effects and differences[-1] == DIFFERENCES[-1] else 0):
         ahead = _ahead(x, rows, of_effects)
         losses = misfit.losses(chart.bent(np.vstack([x, ahead])))
@@ -289,51 +289,87 @@ def fit(
             break
         x = ahead[best - 1]
         x = _descended(x, residual, derivatives, chart, iterations)
-        rows = derivatives(x)
+        rows = derivatives.taken(x)
     u = chart.bent(x)
     errors = misfit.errors(u[None])[0]
     return Fit(u, errors, chart.by_u(rows[: errors.size], u), hypothesis.prior_std, misfit.noise.log_det)
 
 
 class _Derivatives:
-    """Of a residual by x, (m, d), taken once where they are asked for again: at the end of a fit they are there."""
+    """Of a residual by x, (m, d): by differences, which cost the most of a fit, or from before, after a step.
+
+    Args:
+        take: them by differences at some x.
+    """
 
     def __init__(self, take: Callable[[Array], Array]):
-        self._take, self._x, self._rows = take, np.empty(0), np.empty(0)
+        self._take, self._rows, self._taken_at = take, np.empty(0), np.empty(0)
+        self._before: tuple[Array, Array] | None = None
 
-    def __call__(self, x: Array) -> Array:
-        if not np.array_equal(x, self._x):
-            self._x, self._rows = x.copy(), self._take(x)
+    def taken(self, x: Array) -> Array:
+        """By differences at x, once where they are asked for again: at the end of a fit they are there."""
+        if not self.are_taken(x):
+            self._rows, self._taken_at = self._take(x), x.copy()
+        return self._rows
+
+    def are_taken(self, x: Array) -> bool:
+        """Whether what is there was taken at x."""
+        return np.array_equal(x, self._taken_at)
+
+    def forget(self) -> None:
+        """Take them anew where they are next asked for."""
+        self._before = None
+
+    def after_step(self, x: Array, residual: Array) -> Array:
+        """What was there with what the step to x then changed of a residual (m,) along it (Broyden 1965)."""
+        if self._before is None:
+            self.taken(x)
+        else:
+            step, missed = x - self._before[0], residual - self._before[1]
+            missed -= np.einsum("md,d->m", self._rows, step)
+            along = step * np.sum(self._rows**2, axis=0)  # in coordinates that the data tell alike
+            self._rows, self._taken_at = self._rows + np.outer(missed, along / (along @ step)), np.empty(0)
+        self._before = x.copy(), residual.copy()
         return self._rows
 
 
 def _descended(
-    x: Array, residual: Callable[[Array], Array], jacobian: Callable[[Array], Array], chart: Chart, iterations: int
+    x: Array, residual: Callable[[Array], Array], derivatives: _Derivatives, chart: Chart, iterations: int
 ) -> Array:
-    """Where steps downhill lead, with derivatives over one difference."""
+    """Where steps downhill lead, with derivatives over one difference: to where those taken there gain no more."""
 
     def stop(trace: Sequence[minimize.IterLog]) -> None:
         # MuJoCo's own test is of steps relative to the length of x: far from 0, where effects are large, it ends early.
         if trace[-1].reduction < _LEAST_GAIN * trace[-1].objective:
-            raise _NothingLeft(trace[-1].candidate)
+            if derivatives.are_taken(at := np.ravel(trace[-1].candidate)):
+                raise _NothingLeft(at)
+            derivatives.forget()
 
-    try:
-        x, _ = minimize.least_squares(
-            np.clip(x, chart.low, chart.high),
-            residual,
-            bounds=[chart.low, chart.high],
-            jacobian=lambda x, _: jacobian(np.ravel(x)),
-            norm=_HalfSquares(),
-            x_scale="jac",  # damping relative to what the data say of each coordinate
-            mu_max=1e4,
-            mu_factor=10.0,
-            max_iter=iterations,
-            verbose=minimize.Verbosity.SILENT,
-            iter_callback=stop,
-        )
-    except _NothingLeft as end:
-        x = end.args[0]
-    return np.ravel(x)
+    derivatives.forget()
+    x = np.clip(x, chart.low, chart.high)
+    while iterations > 0:
+        try:
+            x, trace = minimize.least_squares(
+                x,
+                residual,
+                bounds=[chart.low, chart.high],
+                jacobian=lambda x, r: derivatives.after_step(np.ravel(x), np.ravel(r)),
+                norm=_HalfSquares(),
+                x_scale="jac",  # damping relative to what the data say of each coordinate
+                mu_max=1e4,
+                mu_factor=10.0,
+                max_iter=iterations,
+                verbose=minimize.Verbosity.SILENT,
+                iter_callback=stop,
+            )
+        except _NothingLeft as end:
+            return np.asarray(end.args[0])
+        x = np.ravel(x)
+        if derivatives.are_taken(x):
+            break
+        derivatives.forget()
+        iterations -= len(trace)
+    return x
 
 
 def _ahead(x: Array, rows: Array, columns: Sequence[int]) -> Array:
