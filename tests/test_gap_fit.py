@@ -131,3 +131,41 @@ def test_derivatives_are_taken_once_at_each_place(arm, monkeypatch):
     found = fits.fit(misfit, start, 5, differences=(0.3, 0.1))
     assert len(taken) == len(set(taken)) >= 2
     assert (0.1, *found.u) in taken
+
+
+def test_derivatives_from_before_tell_what_a_step_changed():
+    """And nothing new of what lies across it, in coordinates that the data tell alike."""
+    rng = np.random.default_rng(0)
+    rows, step, changed = rng.normal(size=(8, 3)) * [1.0, 10.0, 100.0], rng.normal(size=3), rng.normal(size=8)
+    derivatives = fits._Derivatives(lambda _: rows)
+    assert derivatives.after_step(np.zeros(3), np.zeros(8)) is rows
+    assert derivatives.are_taken(np.zeros(3))
+    after = derivatives.after_step(step, changed)
+    np.testing.assert_allclose(after @ step, changed, rtol=1e-12)
+    weights = np.sum(rows**2, axis=0)
+    across = np.cross(weights * step, rng.normal(size=3))
+    np.testing.assert_allclose(after @ across, rows @ across, rtol=1e-9)
+    assert not derivatives.are_taken(step)
+    assert derivatives.taken(step) is rows
+
+
+def test_a_fit_takes_derivatives_where_those_from_before_gain_no_more():
+    """Along the bent valley of Rosenbrock's function to its end, with a few of the derivatives that steps need."""
+    hypothesis: Any = SimpleNamespace(
+        num_plain=0, low=np.full(2, -9.0), high=np.full(2, 9.0), prior_std=np.full(2, np.inf), products=[]
+    )
+    taken, tried = [], []
+
+    def residual(x: np.ndarray) -> np.ndarray:
+        tried.append(x)
+        return np.array([10 * (x[1] - x[0] ** 2), 1 - x[0]])
+
+    def take(x: np.ndarray) -> np.ndarray:
+        taken.append(tuple(x))
+        return np.array([[-20 * x[0], 10.0], [-1.0, 0.0]])
+
+    derivatives = fits._Derivatives(take)
+    end = fits._descended(np.array([-1.2, 1.0]), residual, derivatives, Chart(hypothesis, ()), 50)
+    np.testing.assert_allclose(end, 1.0, atol=1e-2)
+    assert taken[-1] == tuple(end)
+    assert len(set(taken)) == len(taken) < len(tried) / 2

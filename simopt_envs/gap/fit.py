@@ -273,8 +273,10 @@ def fit(
         return np.hstack([misfit.errors(u).reshape(len(u), -1), columns.T * chart.pull]).T
 
     def jacobian(x: Array, difference: float) -> Array:
-        taken = misfit.jacobian(chart.bent(x), fresh, difference, chart)
-        return np.vstack([taken if known is None else np.hstack([known, taken]), np.diag(chart.pull)])
+        rows = [] if known is None else [known]
+        if fresh:
+            rows.append(misfit.jacobian(chart.bent(x), fresh, difference, chart))
+        return np.vstack([np.hstack(rows), np.diag(chart.pull)])
 
     x = chart.straight(np.clip(start, hypothesis.low, hypothesis.high))
     for difference in differences:

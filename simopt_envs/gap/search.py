@@ -11,7 +11,7 @@ import numpy as np
 
 from simopt_envs.adaptation.checkpoint import Result
 from simopt_envs.adaptation.fitting import Noise
-from simopt_envs.engine import Engine, ThreadEngine, counted
+from simopt_envs.engine import Engine, LocalEngine, ThreadEngine, counted
 from simopt_envs.gap.explanation import Explanation, Stage, ranked, rivals_of
 from simopt_envs.gap.fit import DIFFERENCES, Fit, Misfit, fit
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
@@ -158,7 +158,7 @@ class Search:
         if self._floor is None:  # what the first fit leaves is nearer to noise alone than what the model as given does
             self._progress("fit", 0, 2)
             floor = fitted.noise_floor(u)
-            u = self.fit(fitted.with_noise(fitted.noise_at(u, floor)), u, differences).u
+            u, differences = self.fit(fitted.with_noise(fitted.noise_at(u, floor)), u, differences).u, DIFFERENCES[1:]
             self._floor = np.minimum(floor, fitted.noise_floor(u))
         self._progress("fit", 1, 2)
         scale = self._floor * self._tolerance
@@ -227,12 +227,13 @@ class Search:
         """
         base = stage.base
         misfit = Misfit(base.hypothesis, self.data.fitted).with_noise(base.noise)
-        found = self.fit(misfit, self._led_to(stage), DIFFERENCES[1:])
+        found = self.fit(misfit, self._led_to(stage), DIFFERENCES[-1:], base.fit.jacobian)
         if found.loss >= base.fit.loss - _BETTER:
             return stage
         if base.excess < LARGE:
             return self.stage(self.base(base.hypothesis.candidates, found.u), before=stage)
         test = Misfit(base.hypothesis, self.data.held_out).with_noise(base.held_out_noise)
+        found = self.fit(misfit, found.u, DIFFERENCES[1:])
         better = replace(base, fit=found, held_out=HeldOut.of(test, found.u, base.tolerance))
         return ranked(better, stage.screened, stage.trials)
 
@@ -318,8 +319,9 @@ class Search:
                 self._kept.phase(keys[todo[number]], lambda: outcome)
             tell(number, outcome)
 
-        shared = base, self.data.fitted, self.data.held_out, self._engine.num_threads
-        found = dict(zip(todo, self._engine.map(fitted, [refits[i] for i in todo], shared, note), strict=True))
+        engine = self._engine if len(todo) > 1 else LocalEngine()  # one alone may have all cores
+        shared = base, self.data.fitted, self.data.held_out, engine.num_threads
+        found = dict(zip(todo, engine.map(fitted, [refits[i] for i in todo], shared, note), strict=True))
         trials = {}
         for i, (key, refit) in enumerate(zip(keys, refits, strict=True)):
             arrays = self._kept.phase(key, partial(found.__getitem__, i))
@@ -327,10 +329,11 @@ class Search:
             trials[refit.screened.candidate] = Trial(refit.screened.hypothesis, Fit(**arrays), held_out)
         return trials
 
-    def fit(self, misfit: Misfit, start: Array, differences: Sequence[float]) -> Fit:
+    def fit(self, misfit: Misfit, start: Array, differences: Sequence[float], known: Array | None = None) -> Fit:
         """A fit of all parameters, kept like those of candidates."""
-        key = self._key(misfit.hypothesis, misfit.noise, start, np.array(differences))
-        return Fit(**self._kept.phase(key, lambda: vars(fit(misfit, start, ITERATIONS, differences=differences))))
+        given = np.array(differences), np.empty(0) if known is None else known
+        key = self._key(misfit.hypothesis, misfit.noise, start, *given)
+        return Fit(**self._kept.phase(key, lambda: vars(fit(misfit, start, ITERATIONS, known, differences))))
 
     def _key(self, hypothesis: Hypothesis, noise: Noise, *given: Array) -> str:
         """A fit's name; of the noise of starts, what tells one from another is enough."""
