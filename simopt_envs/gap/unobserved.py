@@ -14,9 +14,9 @@ import mujoco
 def unobserved() -> Iterator[None]:
     """Keep MuJoCo from writing of each simulation that runs away, and from timing the stages of each step.
 
-    A search tries some that run away, and notices itself. The Python package of MuJoCo 4 installs ``mjcb_time``, by
-    which each step reads the clock dozens of times for ``MjData.timer``: a third of all that a step of a small model
-    takes. It is the whole process' and is there again afterwards.
+    A search tries some that run away, and notices itself. The Python package of MuJoCo 4 installs ``mjcb_time``, a
+    clock that every stage of every step reads for ``MjData.timer``; of small models that is a third of a step or more
+    (``benchmarks/profiler.py``). It is the whole process', and there again afterwards.
     """
     before = mujoco.get_mju_user_warning()
     clock = _clock()
