@@ -29,6 +29,7 @@ where things touch, and elsewhere fine ones, as coarse ones are bent."""
 _ROUGH = 3.0  # times as unlike as another
 _KINK = 6.0  # medians: four standard deviations
 _LEAST_GAIN = 1e-4  # share of the loss that a step takes away, below which a fit has arrived
+_LEAST_COARSE_GAIN = 1e-3  # the same, over a difference that a finer one follows
 _BEYOND = np.geomspace(3.0, 3000.0, 7)  # standard deviations from where a fit ended, at which it looks again
 _LOOKS = 3  # at most
 _WORTH_GOING = 1.0  # nats
@@ -279,9 +280,11 @@ def fit(
         return np.vstack([np.hstack(rows), np.diag(chart.pull)])
 
     x = chart.straight(np.clip(start, hypothesis.low, hypothesis.high))
+    few = 0 < len(fresh) < len(start)
     for difference in differences:
-        derivatives = _Derivatives(partial(jacobian, difference=difference))
-        x = _descended(x, residual, derivatives, chart, iterations)
+        least = _LEAST_GAIN if difference == differences[-1] else _LEAST_COARSE_GAIN
+        derivatives = _Derivatives(partial(jacobian, difference=difference), few)
+        x = _descended(x, residual, derivatives, chart, iterations, least)
     rows = derivatives.taken(x)
     for _ in range(_LOOKS if of_effects and differences[-1] == DIFFERENCES[-1] else 0):
         ahead = _ahead(x, rows, of_effects)
@@ -302,10 +305,11 @@ class _Derivatives:
 
     Args:
         take: them by differences at some x.
+        few: whether so few are to be taken that each step has its own.
     """
 
-    def __init__(self, take: Callable[[Array], Array]):
-        self._take, self._rows, self._taken_at = take, np.empty(0), np.empty(0)
+    def __init__(self, take: Callable[[Array], Array], few: bool = False):
+        self._take, self._few, self._rows, self._taken_at = take, few, np.empty(0), np.empty(0)
         self._before: tuple[Array, Array] | None = None
 
     def taken(self, x: Array) -> Array:
@@ -324,7 +328,7 @@ class _Derivatives:
 
     def after_step(self, x: Array, residual: Array) -> Array:
         """What was there with what the step to x then changed of a residual (m,) along it (Broyden 1965)."""
-        if self._before is None:
+        if self._few or self._before is None:
             self.taken(x)
         else:
             step, missed = x - self._before[0], residual - self._before[1]
@@ -336,20 +340,23 @@ class _Derivatives:
 
 
 def _descended(
-    x: Array, residual: Callable[[Array], Array], derivatives: _Derivatives, chart: Chart, iterations: int
+    x: Array,
+    residual: Callable[[Array], Array],
+    derivatives: _Derivatives,
+    chart: Chart,
+    iterations: int,
+    least: float = _LEAST_GAIN,
 ) -> Array:
     """Where steps downhill lead, with derivatives over one difference: to where those taken there gain no more."""
 
     def stop(trace: Sequence[minimize.IterLog]) -> None:
         # MuJoCo's own test is of steps relative to the length of x: far from 0, where effects are large, it ends early.
-        if trace[-1].reduction < _LEAST_GAIN * trace[-1].objective:
-            if derivatives.are_taken(at := np.ravel(trace[-1].candidate)):
-                raise _NothingLeft(at)
-            derivatives.forget()
+        if trace[-1].reduction < least * trace[-1].objective:
+            raise _NothingLeft(trace[-1].candidate, trace)
 
-    derivatives.forget()
     x = np.clip(x, chart.low, chart.high)
     while iterations > 0:
+        derivatives.forget()
         try:
             x, trace = minimize.least_squares(
                 x,
@@ -365,12 +372,11 @@ def _descended(
                 iter_callback=stop,
             )
         except _NothingLeft as end:
-            return np.asarray(end.args[0])
+            x, trace = end.args
         x = np.ravel(x)
         if derivatives.are_taken(x):
             break
-        derivatives.forget()
-        iterations -= len(trace)
+        iterations -= len(trace)  # derivatives from before damp steps that those taken would not
     return x
 
 
