@@ -261,7 +261,8 @@ def fit(
         start: u to begin from, (d,).
         iterations: of Gauss-Newton with Levenberg's damping, at most.
         known: the Jacobian by the first k of u, (m, k), where it is known well enough from a fit nearby: it saves the
-            most of the work. None to take all by differences.
+            most of the work. None to take all by differences. Of all of u, where a fit leads is told and no more: the
+            Jacobian returned is that.
         differences: over which derivatives are taken, one after another; from a start that is a fit, fine ones do.
     """
     hypothesis = misfit.hypothesis

@@ -222,8 +222,9 @@ class Search:
     def _polished(self, stage: Stage) -> Stage:
         """A stage from the base fitted from where candidates led its parameters, if it comes out better there.
 
-        Or what a candidate's fit found, and the base's had missed, would count as the candidate's merit. Candidates are
-        fitted anew from there, unless the base is far from the data: then they are in their contest, see below.
+        Or what a candidate's fit found, and the base's had missed, would count as the candidate's merit. Whether there
+        is any is told with the base's derivatives. Candidates are fitted anew from there, unless the base is far from
+        the data: then they are in their contest, see below.
         """
         base = stage.base
         misfit = Misfit(base.hypothesis, self.data.fitted).with_noise(base.noise)
