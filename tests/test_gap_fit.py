@@ -169,3 +169,16 @@ def test_a_fit_takes_derivatives_where_those_from_before_gain_no_more():
     np.testing.assert_allclose(end, 1.0, atol=1e-2)
     assert taken[-1] == tuple(end)
     assert len(set(taken)) == len(taken) < len(tried) / 2
+
+
+def test_a_fit_takes_no_derivatives_where_all_are_known(arm, monkeypatch):
+    """It goes on from a fit nearby to about where one that takes them ends."""
+    hypothesis, misfit = arm
+    start = _at(hypothesis, STIFFNESS, REST)
+    misfit = misfit.with_noise(misfit.noise_at(start, np.array([5e-4, 5e-4, 1e-3, 1e-3, 1e-3])))
+    right = fits.fit(misfit, start, 20, differences=(0.1,))
+    off = np.clip(right.u + 0.1, hypothesis.low, hypothesis.high)
+    monkeypatch.setattr(fits.Misfit, "jacobian", None)
+    found = fits.fit(misfit, off, 20, right.jacobian, (0.1,))
+    assert misfit.losses(off[None])[0] > 20 * right.loss
+    assert found.loss == pytest.approx(right.loss, abs=0.5)
