@@ -13,6 +13,7 @@ from gap_plant import MODEL, record
 
 from simopt_envs.adaptation.fitting import Noise
 from simopt_envs.gap import fit as fits
+from simopt_envs.gap import looks
 from simopt_envs.gap.chart import Chart
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
 from simopt_envs.gap.large import of_some_size
@@ -95,14 +96,13 @@ def test_a_large_effect_is_tried_in_each_shape_at_the_size_that_this_needs(arm):
     assert nearest["stiffness"] > STIFFNESS
 
 
-@pytest.mark.parametrize("looks", [3, 0])
-def test_a_fit_looks_beyond_a_wall(monkeypatch, looks):
+@pytest.mark.parametrize("times", [3, 0])
+def test_a_fit_looks_beyond_a_wall(monkeypatch, times):
     """Errors that fall by steps of 2, but for a wall from 10 to 14, as of a window in which something catches."""
-    monkeypatch.setattr(fits, "_LOOKS", looks)
+    monkeypatch.setattr(fits, "_LOOKS", times)
     bounds = np.full(1, 100.0)
-    hypothesis: Any = SimpleNamespace(
-        num_plain=0, low=-bounds, high=bounds, prior_std=bounds, products=[], reach=np.ones_like
-    )
+    hypothesis: Any = SimpleNamespace(num_plain=0, low=-bounds, high=bounds, prior_std=bounds, products=[], columns={})
+    hypothesis.reach, hypothesis.neutral = np.ones_like, lambda: np.zeros(1)
     misfit = object.__new__(fits.Misfit)
     misfit.hypothesis, misfit.noise = hypothesis, Noise.of(np.ones(1), np.zeros((1, 1, 20, 1)))
     samples = np.linspace(-1.0, 1.0, 20)
@@ -113,7 +113,21 @@ def test_a_fit_looks_beyond_a_wall(monkeypatch, looks):
 
     monkeypatch.setattr(misfit, "errors", errors)
     (end,) = fits.fit(misfit, np.array([4.0]), 20).u
-    assert (end > 14) == (looks > 0), end
+    assert (end > 14) == (times > 0), end
+
+
+def test_a_fit_looks_at_other_sizes_with_all_else_where_it_then_belongs():
+    """Here p belongs at 2 a and a at 8, of which the derivative by a tells nothing."""
+    bounds = np.full(2, 30.0)
+    hypothesis: Any = SimpleNamespace(low=-bounds, high=bounds, prior_std=bounds, products=[], columns={SPRING: [1]})
+    hypothesis.amounts, hypothesis.neutral = lambda _: [1], lambda: np.zeros(2)
+
+    def residual(x: np.ndarray) -> np.ndarray:
+        return np.array([10 * (x[0] - 2 * x[1]), x[1] - 8])
+
+    rows = np.array([[10.0, 0.0], [0.0, 0.0]])
+    ahead = looks.of_other_sizes(np.array([2.0, 1.0]), rows, residual, Chart(hypothesis, ()), hypothesis)
+    np.testing.assert_allclose(ahead, [[10.0, 5.0], [6.0, 3.0], [3.4, 1.7]])
 
 
 def test_derivatives_are_taken_once_at_each_place(arm, monkeypatch):

@@ -16,6 +16,7 @@ from mujoco import minimize
 from simopt_envs.adaptation.fitting import Noise
 from simopt_envs.gap.chart import Chart
 from simopt_envs.gap.hypothesis import Hypothesis
+from simopt_envs.gap.looks import along_uncertain, of_other_sizes
 from simopt_envs.measured.replay import start_curvature, start_sensitivity
 from simopt_envs.measured.windows import Windows
 from simopt_envs.physics.parameters import Array
@@ -30,7 +31,6 @@ _ROUGH = 3.0  # times as unlike as another
 _KINK = 6.0  # medians: four standard deviations
 _LEAST_GAIN = 1e-4  # share of the loss that a step takes away, below which a fit has arrived
 _LEAST_COARSE_GAIN = 1e-3  # the same, over a difference that a finer one follows
-_BEYOND = np.geomspace(3.0, 3000.0, 7)  # standard deviations from where a fit ended, at which it looks again
 _LOOKS = 3  # at most
 _WORTH_GOING = 1.0  # nats
 _DIVERGED = 30.0  # the error, in units of noise, of a sample that a simulation did not reach
@@ -253,8 +253,9 @@ def fit(
 ) -> Fit:
     """The most probable u.
 
-    Where it ends, it looks along what the data know least of the effects, near and far, and goes on where that is
-    better: something that catches in one window, at some values alone, makes a wall that no small step gets over.
+    Where it ends, it looks along what the data know least of the effects, near and far, and at other sizes of each, and
+    goes on where that is better: something that catches in one window, at some values alone, makes a wall that no small
+    step gets over.
 
     Args:
         misfit: of a hypothesis.
@@ -288,7 +289,9 @@ def fit(
         x = _descended(x, residual, derivatives, chart, iterations, least)
     rows = derivatives.taken(x)
     for _ in range(_LOOKS if of_effects and differences[-1] == DIFFERENCES[-1] else 0):
-        ahead = _ahead(x, rows, of_effects)
+        ahead = along_uncertain(x, rows, of_effects)
+        if not few:
+            ahead = np.vstack([ahead, of_other_sizes(x, rows, residual, chart, hypothesis)])
         losses = misfit.losses(chart.bent(np.vstack([x, ahead])))
         best = int(np.argmin(losses))
         if losses[best] > losses[0] - _WORTH_GOING:
@@ -379,14 +382,3 @@ def _descended(
             break
         iterations -= len(trace)  # derivatives from before damp steps that those taken would not
     return x
-
-
-def _ahead(x: Array, rows: Array, columns: Sequence[int]) -> Array:
-    """Coordinates far along the axes of what is uncertain of some columns, the others as these foretell, (n, d)."""
-    columns_first = np.ascontiguousarray(rows.T)
-    covariance = np.linalg.pinv(np.einsum("im,jm->ij", columns_first, columns_first), hermitian=True)
-    variances, axes = np.linalg.eigh(covariance[np.ix_(columns, columns)])
-    known = variances > 0
-    along = covariance[:, columns] @ (axes[:, known] / np.sqrt(variances[known]))
-    steps = np.concatenate([-_BEYOND, _BEYOND])
-    return x + (steps[:, None, None] * along.T).reshape(-1, len(x))
