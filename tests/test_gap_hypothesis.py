@@ -174,6 +174,21 @@ def test_differences_in_an_amount_are_no_larger_than_it_or_its_smallest_probe(ar
     assert probes[0] < 0.02 * probes[-1] == pytest.approx(0.02)
 
 
+def test_a_fit_counts_a_spring_in_a_joint_by_how_much_it_gives(arm):
+    """In which its law is linear: half a probe is a spring of twice the stiffness, and none of it is rigid."""
+    plain, _, motion = arm
+    soft = Candidate(EFFECTS["joint_elasticity"], "joint:elbow")
+    hypothesis = Hypothesis(plain, [soft], motion)
+    (column,) = hypothesis.columns[soft]
+    neutral, probe = hypothesis.neutral(), hypothesis.probes(soft)[-1]
+    rigid, half, whole = hypothesis.xi(np.array([neutral, (neutral + probe) / 2, probe]))[:, column]
+    assert rigid == hypothesis.space.high[column] == hypothesis.space.nominal[column]
+    assert half == pytest.approx(2 * whole, rel=1e-3)
+    assert hypothesis.low[column] <= neutral[column] + 1e-9 < probe[column] < hypothesis.high[column]
+    np.testing.assert_allclose(hypothesis.coordinates(hypothesis.xi(probe[None]))[0], probe, atol=1e-9)
+    assert hypothesis.xi((neutral - 1.0)[None])[0, column] == rigid
+
+
 def test_a_plain_parameter_goes_no_farther_than_its_prior_has_it_and_an_effect_is_free(arm):
     plain, _, motion = arm
     hypothesis = Hypothesis(plain, [Candidate(EFFECTS["viscous_friction"], "joint:elbow")], motion)

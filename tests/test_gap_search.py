@@ -11,6 +11,7 @@ import pytest
 from conftest import needs_effects
 from gap_plant import MODEL, Law, record
 
+from simopt_envs.engine import LocalEngine
 from simopt_envs.gap import fit as fits
 from simopt_envs.gap import search as searches
 from simopt_envs.gap.explanation import ranked
@@ -227,6 +228,14 @@ def test_a_limit_is_there_where_it_acts(limit):
     start[: hypothesis.num_plain] = 0.0
     base = search.base((LIMIT,), start)
     assert is_there(base.hypothesis, LIMIT, *base.by_all(search.data)) == (limit < 3)
+
+
+@pytest.mark.parametrize(("friction", "limit"), [(0.3, None), (0.0, 1.2)])
+def test_a_limit_promises_nothing_that_only_its_opposite_would_give(friction, limit):
+    """Of dry friction, less than no limit at all would explain much, to first order."""
+    search = _search(lambda q, v: np.array([0.0, -friction * np.tanh(v[1] / 0.01)]), (LIMIT,), limit)
+    (screened,) = screen(search.base(), (LIMIT,), search.data.fitted, LocalEngine(), lambda *_: None)
+    assert (screened.gain > EVIDENCE) == (limit is not None), screened.gain
 
 
 @pytest.mark.parametrize("limit", [0.4, 1.0, 1.2, 1.5])

@@ -78,12 +78,14 @@ class Hypothesis:
             parameters += added
         self.space = ParameterSpace(parameters)
         self.num_plain = len(plain.prior.space)
-        nominal = self.space.to_unconstrained(self.space.nominal)
+        reciprocal = {c.full_name(name) for c in candidates for name in c.effect.reciprocal}
+        self._reciprocal = np.array([name in reciprocal for name in self.space.names])
+        nominal = self._linear(self.space.nominal)
         self._centre, self._unit, self._least = nominal.copy(), np.ones(len(nominal)), np.ones(len(nominal))
         self._centre[: self.num_plain] = plain.prior.mean
         self._unit[: self.num_plain] = plain.prior.std
         for candidate, columns in self.columns.items():
-            z = np.array([self.space.to_unconstrained(self._probe(candidate, p)) for p in self._probes(candidate)])
+            z = np.array([self._linear(self._probe(candidate, p)) for p in self._probes(candidate)])
             sizes = np.abs(z - nominal)[:, columns]
             size, smallest = sizes.max(axis=0), np.where(sizes > 0, sizes, np.inf).min(axis=0)
             self._unit[columns] = np.where(size > 0, size, 1.0)
@@ -93,7 +95,7 @@ class Hypothesis:
                     self._unit[i] = np.median(np.diff(tried))
         self.prior_std = np.full(len(nominal), _FREE)
         self.prior_std[: self.num_plain] = 1.0
-        self.low, self.high = (self.coordinates(bound) for bound in (self.space.low, self.space.high))
+        self.low, self.high = np.sort([self.coordinates(bound) for bound in (self.space.low, self.space.high)], axis=0)
         within = np.where(np.arange(len(nominal)) < self.num_plain, FARTHEST, np.inf)
         self.low, self.high = np.maximum(self.low, -within), np.minimum(self.high, within)
 
@@ -107,11 +109,19 @@ class Hypothesis:
     def xi(self, u: Array) -> Array:
         """Coordinates (n, d) -> physical values, within the bounds."""
         z = self._centre + self._unit * u
-        return np.clip(self.space.from_unconstrained(z), self.space.low, self.space.high)
+        xi = self.space.from_unconstrained(z)
+        xi[..., self._reciprocal] = 1 / np.maximum(z[..., self._reciprocal], 1 / self.space.high[self._reciprocal])
+        return np.clip(xi, self.space.low, self.space.high)
 
     def coordinates(self, xi: Array) -> Array:
         """Physical values (..., d) -> u."""
-        return (self.space.to_unconstrained(xi) - self._centre) / self._unit
+        return (self._linear(xi) - self._centre) / self._unit
+
+    def _linear(self, xi: Array) -> Array:
+        """Physical values (..., d) as laws take them: logarithms of log quantities, reciprocals of reciprocal ones."""
+        z = self.space.to_unconstrained(xi)
+        z[..., self._reciprocal] = 1 / xi[..., self._reciprocal]
+        return z
 
     def probes(self, candidate: Candidate) -> Array:
         """The effect's probes (k, d) in u, the rest at 0."""

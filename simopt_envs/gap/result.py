@@ -232,7 +232,7 @@ def named_effects(explanation: Explanation) -> tuple[Named, ...]:
     hypothesis, u = final.hypothesis, final.fit.u
     spread = final.spread(explanation.data)
     ends = u + CONFIDENT * np.array([-spread, spread])
-    xi, (low, high) = hypothesis.xi(u[None])[0], hypothesis.xi(ends)
+    xi, (low, high) = hypothesis.xi(u[None])[0], np.sort(hypothesis.xi(ends), axis=0)
     return tuple(
         Named(
             score.candidate,

@@ -128,7 +128,12 @@ def _screened(hypothesis: Hypothesis, probes: Array, changes: Array, base: Base)
 
 
 def _clipped(step: float, shift: Array, neutral: Array, hypothesis: Hypothesis, columns: list[int]) -> float:
-    """A step along a shift of some coordinates that stays within their bounds and is not absurdly long."""
+    """A step along a shift of some coordinates that stays within their bounds and is not absurdly long.
+
+    What has no amount, as a limit, is there as it was tried, or milder: there is no opposite of it.
+    """
+    if not columns:
+        return float(np.clip(step, 0.0, 1.0))
     moving = [c for c in columns if shift[c]]
     bounds = np.array([hypothesis.low[moving], hypothesis.high[moving]])
     ends = (bounds - neutral[moving]) / shift[moving]

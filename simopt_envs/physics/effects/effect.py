@@ -44,6 +44,7 @@ class Effect(ABC):
         law: one line, as a person would write it.
         shape: those of its parameters that say what it is like, not how much of it there is.
         levers: those of its shape in whose product with its amount, its first parameter, the law is linear.
+        reciprocal: those of its parameters that are none at infinity, and in whose reciprocal the law is linear.
         extends: the effect that it is without some of its amounts, if any; their other parameters have the same names.
         of_reading: whether it is about what recordings show of its place, which must then be among their columns.
     """
@@ -52,6 +53,7 @@ class Effect(ABC):
     law: ClassVar[str]
     shape: ClassVar[tuple[str, ...]] = ()
     levers: ClassVar[tuple[str, ...]] = ()
+    reciprocal: ClassVar[tuple[str, ...]] = ()
     extends: ClassVar[str] = ""
     of_reading: ClassVar[bool] = False
 

@@ -29,6 +29,7 @@ class JointElasticity(Effect):
 
     name = "joint_elasticity"
     law = "f = -k (q_link - q_motor)"
+    reciprocal = ("stiffness",)
 
     def places(self, model: mujoco.MjModel) -> tuple[str, ...]:
         """Hinges and slides that are the last joints of their bodies; none under RK4, where damping is explicit."""
