@@ -25,8 +25,8 @@ is new since seeds 23000 had been run (one case). Since seeds 24000 had, finer d
 too, where they are not rough (``gap/fit.py``; one kind of case, in three splits). Since seeds 25000 had, what takes
 much of the held-out errors is fitted wherever the screen has it (``FORETOLD``, ``FORETELLING``; one case), and what
 earns ``EVIDENCE_EACH`` by a coarse fit, not ``EVIDENCE``, is fitted in full (one case). Since seeds
-27000 had, fits over coarse differences end sooner (``gap/fit.py``), for their time alone. Since seeds 28000 had, fits of
-all parameters look at other sizes of the effects (``gap/looks.py``; one case).
+27000 had, fits over coarse differences end sooner (``gap/fit.py``), for their time alone. Since seeds
+28000 had, fits of all parameters look at other sizes of the effects (``gap/looks.py``; one case).
 
 What fitted values must be for an effect's name to fit them is with the effects (``Effect.is_itself``): that a cogging
 shows a whole period is asked since seeds 20000 had been run (one case, and one of the gap demonstration).
