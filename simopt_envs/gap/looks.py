@@ -49,6 +49,8 @@ def of_other_sizes(
     u, neutral, found = chart.bent(x), hypothesis.neutral(), [np.empty((0, len(x)))]
     for candidate, own in hypothesis.columns.items():
         amounts, others = hypothesis.amounts(candidate), np.setdiff1d(np.arange(len(x)), own)
+        if not amounts:
+            continue
         sized = np.tile(u, (len(_SIZES), 1))
         sized[:, amounts] = neutral[amounts] + _SIZES[:, None] * (u - neutral)[amounts]
         sized = np.clip(chart.straight(np.clip(sized, hypothesis.low, hypothesis.high)), chart.low, chart.high)

@@ -59,7 +59,8 @@ def fitted(refit: Refit, base: Base, windows: Windows, held_out: Windows, num_th
     counts errors in its own noise where they are likelier in that: what uncertain starts leave depends on the model, as
     friction brings them to rest.
 
-    Starts are told apart by those windows alone of which the base leaves the most, then fitted to all.
+    Starts are told apart by those windows alone of which the base leaves the most, then fitted to all. Where that led
+    to what is farther from all windows than a start was, the candidate is fitted from that start, too.
     """
     screened, hypothesis = refit.screened, refit.screened.hypothesis
     misfit, test = (Misfit(hypothesis, some, num_threads) for some in (windows, held_out))
@@ -79,10 +80,15 @@ def fitted(refit: Refit, base: Base, windows: Windows, held_out: Windows, num_th
             far = of_some_size(on(base.worst(SECONDS / windows.seconds)), screened.candidate, neutral)
             known = half.jacobian(far[0], of_base, DIFFERENCES[0])
             coarse += [_coarsely(half, u, known) for u in far]
-        best = int(np.argmin(misfit.losses(np.array(coarse))))
+        direct = misfit.best(starts)
+        losses = misfit.losses(np.array([*coarse, direct]))
+        best = int(np.argmin(losses[:-1]))
         near = best < len(starts)
         known = base.fit.jacobian if near else misfit.jacobian(coarse[best], of_base, DIFFERENCES[0])
         found = fit(misfit, coarse[best], ITERATIONS, known=known, differences=DIFFERENCES[1:])
+        if losses[-1] < losses[best]:
+            other = fit(misfit, direct, ITERATIONS, known=base.fit.jacobian, differences=DIFFERENCES[1:])
+            found = min(found, other, key=lambda fit: fit.loss)
         foreseen = base.held_out.jacobian
     else:
         others = [_coarsely(half, u, half.jacobian(u, of_base, DIFFERENCES[0])) for u in refit.others]

@@ -298,9 +298,9 @@ class Search:
         been in their turn; the best of a stage before, from another fit of the base, may go on from there.
         """
         earlier = {} if before is None else {s.candidate: s.trial for s in before.scores[:_FITTED_IN_FULL]}
-        first = [s for s in screened if s.candidate in trials][:1]
+        first = [s for s in screened if s.candidate in trials][:_FITTED_IN_FULL]
         best = {s.candidate for s in ranked(base, screened, trials).scores[:_FITTED_IN_FULL] if s.total > EVIDENCE_EACH}
-        best.update(s.candidate for s in first if s.gain > EVIDENCE)
+        best.update(s.candidate for s in first if 2 * s.gain > EVIDENCE)  # with as much on the windows held out
         best.update(c for c in trials if (smaller := extended(c, trials)) in best and smaller not in done)
         refits = []
         for one in screened:
@@ -364,7 +364,7 @@ class Search:
             score = score_of(without, effect, base, worth_of(base))
             stays = score.needed and itself[effect] and is_there(*told)
             rivals = rivals_of(effect, stays, without, stages) - dropped - {*effects}
-            if rivals:
+            if rivals and len(dropped) < MOST_EFFECTS:  # or what is outside the library has one try after another
                 screened = self._screened(without)
                 trials = self.trials(without, [Refit(s) for s in screened if s.candidate in rivals])
                 trials = self._in_full(without, screened, trials) | ({effect: base} if stays else {})

@@ -26,7 +26,9 @@ too, where they are not rough (``gap/fit.py``; one kind of case, in three splits
 much of the held-out errors is fitted wherever the screen has it (``FORETOLD``, ``FORETELLING``; one case), and what
 earns ``EVIDENCE_EACH`` by a coarse fit, not ``EVIDENCE``, is fitted in full (one case). Since seeds
 27000 had, fits over coarse differences end sooner (``gap/fit.py``), for their time alone. Since seeds
-28000 had, fits of all parameters look at other sizes of the effects (``gap/looks.py``; one case).
+28000 had, fits of all parameters look at other sizes of the effects (``gap/looks.py``; one case). Since seeds
+29000 had, the first three of the screen are fitted in full, from half of ``EVIDENCE`` on, where it was the first, from
+all of it (one case of seeds 28000), and no rivals are tried once ``MOST_EFFECTS`` have given way (one case).
 
 What fitted values must be for an effect's name to fit them is with the effects (``Effect.is_itself``): that a cogging
 shows a whole period is asked since seeds 20000 had been run (one case, and one of the gap demonstration).
@@ -104,7 +106,7 @@ COARSE = 3.0
 """Times the sensors' noise, left by the best candidate in a channel, from which fits count errors in what is left."""
 
 MOST_EFFECTS = 4
-"""Effects that are looked for at once."""
+"""Effects that are looked for at once, and that may give way to others before these are no longer tried."""
 
 CONFOUNDED = 0.9
 """Correlation of what two effects change, plain parameters projected out, from which they are called confounded."""
