@@ -88,7 +88,7 @@ def fitted(refit: Refit, base: Base, windows: Windows, held_out: Windows, num_th
         found = fit(misfit, coarse[best], ITERATIONS, known=known, differences=DIFFERENCES[1:])
         if losses[-1] < losses[best]:
             other = fit(misfit, direct, ITERATIONS, known=base.fit.jacobian, differences=DIFFERENCES[1:])
-            found = min(found, other, key=lambda fit: fit.loss)
+            found = min(found, other, key=lambda one: one.loss)
         foreseen = base.held_out.jacobian
     else:
         others = [_coarsely(half, u, half.jacobian(u, of_base, DIFFERENCES[0])) for u in refit.others]
