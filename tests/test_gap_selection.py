@@ -13,8 +13,10 @@ from simopt_envs.gap.large import of_several_effects
 from simopt_envs.gap.recordings import split
 from simopt_envs.gap.result import judge
 from simopt_envs.gap.selection import Score, chosen, may_be_itself, tolerance_of
+from simopt_envs.gap.trial import Base
 from simopt_envs.measured import Recording
 from simopt_envs.physics.effects import EFFECTS
+from simopt_envs.physics.parameters import Array
 
 
 def _recording(speed: float) -> Recording:
@@ -151,14 +153,37 @@ def test_a_simpler_law_gives_way_by_all_that_the_data_say(fitted, simple_wins):
     ],
 )
 def test_an_effect_that_makes_most_windows_right_explains_a_part(null, final, outliers, verdict):
-    def base(mean_squares: list[float]) -> Any:
-        errors = np.sqrt(mean_squares)[:, None, None] * np.ones((1, 26, 2))
-        excess = float(np.mean(errors**2)) - 1
-        return SimpleNamespace(held_out=SimpleNamespace(errors=errors), excess=excess, unforeseen=excess)
+    assert judge(_explanation(null, null, final, final, outliers)) == verdict
 
-    data = SimpleNamespace(outliers=outliers * (("a recording", 0.5, 1.0),))
-    explanation: Any = SimpleNamespace(null=base(null), final=base(final), effects=("one",), data=data)
+
+@pytest.mark.parametrize(
+    ("fitted", "held_out", "verdict"),
+    [
+        (4.0, 8.5, "partly"),  # its form fits the motions held out less well
+        (9.5, 6.0, "unexplained"),  # it happens to fit these alone
+    ],
+)
+def test_what_effects_explain_is_told_from_all_recordings(fitted, held_out, verdict):
+    explanation = _explanation([10.0] * 6, [10.0] * 4, [fitted] * 6, [held_out] * 4)
     assert judge(explanation) == verdict
+
+
+def _explanation(
+    fitted: list[float], held_out: list[float], then_fitted: list[float], then: list[float], outliers: int = 0
+) -> Any:
+    """Of a gap of which one effect takes some: mean squares of each window's errors, without it and then with it."""
+
+    def errors(mean_squares: list[float]) -> Array:
+        return np.sqrt(mean_squares)[:, None, None] * np.ones((1, 26, 2))
+
+    def base(fitted: list[float], held_out: list[float]) -> Base:
+        fit: Any = SimpleNamespace(errors=errors(fitted) / 2)  # counted in twice the sensors' noise
+        of_held_out: Any = SimpleNamespace(errors=errors(held_out))
+        unused: Any = None
+        return Base(unused, fit, of_held_out, unused, unused, tolerance=np.full(2, 2.0))
+
+    data: Any = SimpleNamespace(outliers=outliers * (("a recording", 0.5, 1.0),))
+    return SimpleNamespace(null=base(fitted, held_out), final=base(then_fitted, then), effects=("one",), data=data)
 
 
 def test_errors_count_in_what_is_left_only_where_that_is_far_more_than_noise():

@@ -222,7 +222,8 @@ def judge(explanation: Explanation) -> Verdict:
     if right:
         return "named" if whole else "partly"
     before, after = (of_median_window(base.held_out.errors) for base in (explanation.null, explanation.final))
-    enough = explanation.final.excess < (1 - LEAST_SHARE) * explanation.null.excess or after < EXPLAINED < before
+    least = (1 - LEAST_SHARE) * explanation.null.excess_everywhere
+    enough = explanation.final.excess_everywhere < least or after < EXPLAINED < before
     return "partly" if enough else "unexplained"
 
 

@@ -28,7 +28,9 @@ earns ``EVIDENCE_EACH`` by a coarse fit, not ``EVIDENCE``, is fitted in full (on
 27000 had, fits over coarse differences end sooner (``gap/fit.py``), for their time alone. Since seeds
 28000 had, fits of all parameters look at other sizes of the effects (``gap/looks.py``; one case). Since seeds
 29000 had, the first three of the screen are fitted in full, from half of ``EVIDENCE`` on, where it was the first, from
-all of it (one case of seeds 28000), and no rivals are tried once ``MOST_EFFECTS`` have given way (one case).
+all of it (one case of seeds 28000), and no rivals are tried once ``MOST_EFFECTS`` have given way (one case). Since
+then, too, ``LEAST_SHARE`` is of the excess of all windows, not of those held out alone (one case each of seeds 25000
+and 26000).
 
 What fitted values must be for an effect's name to fit them is with the effects (``Effect.is_itself``): that a cogging
 shows a whole period is asked since seeds 20000 had been run (one case, and one of the gap demonstration).
@@ -70,8 +72,8 @@ LEFT_SHARE = 0.8
 another form leaves, one effect is taken not to explain so much."""
 
 LEAST_SHARE = 0.35
-"""Share of the held-out excess that the effects must take away, or make the median window right, or the gap is
-unexplained."""
+"""Share of the excess, of windows fitted and held out together, that the effects must take away, or make the median
+window held out right, or the gap is unexplained."""
 
 CONFIDENT = 1.96
 """Standard deviations to either side of what was fitted that make an interval (95 %), and that an effect must be off

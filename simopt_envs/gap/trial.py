@@ -145,6 +145,11 @@ class Base(Trial):
         return self.noise.scale / self.tolerance
 
     @property
+    def excess_everywhere(self) -> float:
+        """The excess of the windows held out and that of those fitted, together: either alone is of few motions."""
+        return self.excess + float(np.mean((self.tolerance * self.fit.errors) ** 2)) - 1.0
+
+    @property
     def strained(self) -> bool:
         """Whether its plain parameters, all together, are as improbable as one alone that speaks for an effect."""
         plain = self.fit.u[: self.hypothesis.num_plain]
