@@ -20,6 +20,7 @@ from simopt_envs.gap.fit import Misfit
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
 from simopt_envs.gap.localise import localise
 from simopt_envs.gap.motion import motion_of
+from simopt_envs.gap.muted import muted
 from simopt_envs.gap.plain import Plain, plain_parameters
 from simopt_envs.gap.recordings import longer_windows, read_windows
 from simopt_envs.gap.result import Gap, judge, named_effects, repair
@@ -27,7 +28,6 @@ from simopt_envs.gap.search import Progress, Search
 from simopt_envs.gap.separate import separate
 from simopt_envs.gap.sizes import of_best_length
 from simopt_envs.gap.trial import Base, Data
-from simopt_envs.gap.unobserved import unobserved
 from simopt_envs.gap.wild_starts import without_wild_starts
 from simopt_envs.measured.mapping import LogMapping
 from simopt_envs.measured.readers import load_recordings
@@ -116,7 +116,7 @@ def read(
     ]
     data = read_windows(start.model, logs, keyframe)
     motion = motion_of(start.model, logs, keyframe)
-    with unobserved():
+    with muted():
         data = _without_wild_starts(start, data, motion)
     longer = longer_windows(start.model, data, keyframe)
     return Problem(given, start, data, motion, longer, keyframe, began)
@@ -124,7 +124,7 @@ def read(
 
 def refitted(problem: Problem, progress: Progress = lambda *_: None) -> Base:
     """The model with its plain parameters fitted, which a search begins with."""
-    with unobserved():
+    with muted():
         return Search(problem.plain, problem.data, problem.motion, (), progress).base()
 
 
@@ -139,7 +139,7 @@ def solve(
     """What is missing, see :func:`find_gap`; ``null``, if it is there already, is what :func:`refitted` gives."""
     plain, data = problem.plain, problem.data
     seen = tuple(c for effect in effects for c in _places(effect, plain.model) if _shows(c, plain.model, data.fitted))
-    with unobserved():
+    with muted():
         search = Search(plain, data, problem.motion, seen, progress, engine, directory, problem.longer, null)
         found = search.run()
         if judge(found) == "partly":

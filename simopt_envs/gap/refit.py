@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from simopt_envs.adaptation.checkpoint import Result
-from simopt_envs.gap.fit import DIFFERENCES, Misfit, fit
+from simopt_envs.gap.fit import DIFFERENCES, Fit, Misfit, fit
 from simopt_envs.gap.hypothesis import Candidate
 from simopt_envs.gap.large import SECONDS, best_of_each, of_some_size
 from simopt_envs.gap.plain import SPEAKS_FOR
@@ -50,53 +50,69 @@ class Refit:
 
 
 def fitted(refit: Refit, base: Base, windows: Windows, held_out: Windows, num_threads: int) -> Result:
-    """The fit of a candidate, and its errors on what was held out.
+    """The fit of a candidate, and its errors on what was held out."""
+    hypothesis = refit.screened.hypothesis
 
-    Derivatives by what the base has are known from there. Where the base is far from the data or from its priors, the
-    candidate is fitted at the size that it would need, too: with what speaks for it taken away, and with all plain
-    parameters at their priors' means; derivatives by these are taken once, there. A base that an effect has bent is the
-    end of a valley that leads away from the right one. A fit that goes on from another takes them all at each step, and
-    counts errors in its own noise where they are likelier in that: what uncertain starts leave depends on the model, as
-    friction brings them to rest.
+    def on(rows: NDArray[np.intp]) -> Misfit:
+        return Misfit(hypothesis, windows.select(rows), num_threads).with_noise(base.noise.select(rows))
+
+    misfit, test = (Misfit(hypothesis, some, num_threads) for some in (windows, held_out))
+    misfit, test = misfit.with_noise(base.noise), test.with_noise(base.held_out_noise)
+    if refit.near is None:
+        found, foreseen = _first(refit, base, misfit, on, windows.seconds), base.held_out.jacobian
+    else:
+        found, foreseen = _further(refit, base, refit.near, misfit, on), None
+        test = test.with_own_noise(found.u)
+    told = HeldOut.of(test, found.u, base.tolerance, foreseen)
+    return {**vars(found), **{f"held_out_{name}": array for name, array in vars(told).items()}}
+
+
+def _first(refit: Refit, base: Base, misfit: Misfit, on: Callable[[NDArray[np.intp]], Misfit], seconds: float) -> Fit:
+    """From what the screen found, with derivatives by what the base has known from there.
+
+    Where the base is far from the data or from its priors, the candidate is fitted at the size that it would need, too:
+    with what speaks for it taken away, and with all plain parameters at their priors' means; derivatives by these are
+    taken once, there. A base that an effect has bent is the end of a valley that leads away from the right one.
 
     Starts are told apart by those windows alone of which the base leaves the most, then fitted to all. Where that led
     to what is farther from all windows than a start was, the candidate is fitted from that start, too.
     """
-    screened, hypothesis = refit.screened, refit.screened.hypothesis
-    misfit, test = (Misfit(hypothesis, some, num_threads) for some in (windows, held_out))
-    misfit, test = misfit.with_noise(base.noise), test.with_noise(base.held_out_noise)
-    rows, of_base = base.worst(len(windows) / 2), range(len(base.fit.u))
-
-    def on(some: NDArray[np.intp]) -> Misfit:
-        return Misfit(hypothesis, windows.select(some), num_threads).with_noise(base.noise.select(some))
-
+    hypothesis, of_base, base_jacobian = misfit.hypothesis, range(len(base.fit.u)), base.fit.jacobian
+    num_windows = len(base.fit.errors)
+    rows = base.worst(num_windows / 2)
     half = on(rows)
-    if refit.near is None:
-        starts = best_of_each(half, screened.starts)
-        known = base.fit.jacobian.reshape(len(windows), -1, len(of_base))[rows].reshape(-1, len(of_base))
-        coarse = [_coarsely(half, u, known) for u in starts]
-        for afar in refit.far:
-            neutral = np.concatenate([afar, hypothesis.neutral()[len(afar) :]])
-            far = of_some_size(on(base.worst(SECONDS / windows.seconds)), screened.candidate, neutral)
-            known = half.jacobian(far[0], of_base, DIFFERENCES[0])
-            coarse += [_coarsely(half, u, known) for u in far]
-        direct = misfit.best(starts)
-        losses = misfit.losses(np.array([*coarse, direct]))
-        best = int(np.argmin(losses[:-1]))
-        near = best < len(starts)
-        known = base.fit.jacobian if near else misfit.jacobian(coarse[best], of_base, DIFFERENCES[0])
-        found = fit(misfit, coarse[best], ITERATIONS, known=known, differences=DIFFERENCES[1:])
-        if losses[-1] < losses[best]:
-            other = fit(misfit, direct, ITERATIONS, known=base.fit.jacobian, differences=DIFFERENCES[1:])
-            found = min(found, other, key=lambda one: one.loss)
-        foreseen = base.held_out.jacobian
-    else:
+    starts = best_of_each(half, refit.screened.starts)
+    known = base_jacobian.reshape(num_windows, -1, len(of_base))[rows].reshape(-1, len(of_base))
+    coarse = [_coarsely(half, u, known) for u in starts]
+    for afar in refit.far:
+        neutral = np.concatenate([afar, hypothesis.neutral()[len(afar) :]])
+        far = of_some_size(on(base.worst(SECONDS / seconds)), refit.screened.candidate, neutral)
+        known = half.jacobian(far[0], of_base, DIFFERENCES[0])
+        coarse += [_coarsely(half, u, known) for u in far]
+    direct = misfit.best(starts)
+    losses = misfit.losses(np.array([*coarse, direct]))
+    best = int(np.argmin(losses[:-1]))
+    known = base_jacobian if best < len(starts) else misfit.jacobian(coarse[best], of_base, DIFFERENCES[0])
+    found = fit(misfit, coarse[best], ITERATIONS, known=known, differences=DIFFERENCES[1:])
+    if losses[-1] < losses[best]:
+        other = fit(misfit, direct, ITERATIONS, known=base_jacobian, differences=DIFFERENCES[1:])
+        found = min(found, other, key=lambda one: one.loss)
+    return found
+
+
+def _further(refit: Refit, base: Base, near: Array, misfit: Misfit, on: Callable[[NDArray[np.intp]], Misfit]) -> Fit:
+    """On from another fit, with all derivatives taken at each step.
+
+    Errors are counted in the noise of its own where they are likelier in that: what uncertain starts leave depends on
+    the model, as friction brings them to rest.
+    """
+    others: list[Array] = []
+    if refit.others:
+        half = on(base.worst(len(base.fit.errors) / 2))
+        of_base = range(len(base.fit.u))
         others = [_coarsely(half, u, half.jacobian(u, of_base, DIFFERENCES[0])) for u in refit.others]
-        start = misfit.best(np.array([refit.near, *others]))
-        found = fit(misfit.with_own_noise(start), start, ITERATIONS, differences=DIFFERENCES[1:])
-        test, foreseen = test.with_own_noise(found.u), None
-    told = HeldOut.of(test, found.u, base.tolerance, foreseen)
-    return {**vars(found), **{f"held_out_{name}": array for name, array in vars(told).items()}}
+    start = misfit.best(np.array([near, *others]))
+    return fit(misfit.with_own_noise(start), start, ITERATIONS, differences=DIFFERENCES[1:])
 
 
 def _coarsely(misfit: Misfit, start: Array, known: Array) -> Array:

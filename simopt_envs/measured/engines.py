@@ -14,6 +14,7 @@ from simopt_envs.measured.channels import Channel, read_channels
 from simopt_envs.measured.resample import Array
 from simopt_envs.measured.states import States
 from simopt_envs.physics.parameters import ParameterSpace
+from simopt_envs.physics.profiler import PROFILER_RESTS
 from simopt_envs.physics.writer import ModelWriter
 
 if TYPE_CHECKING:
@@ -56,13 +57,14 @@ class BatchEngine:
         # One step more than the window is long: derived fields lag the state by a step.
         commands = np.concatenate([commands, commands[:, -1:]], axis=1)
         fields = list(field_sizes(self._model, windows.channels))
-        records = batch.rollout(
-            commands.shape[1],
-            control=commands if self._model.nu else None,
-            control_spec=int(mujoco.mjtState.mjSTATE_CTRL),
-            record=[*fields, mujoco.mjtState.mjSTATE_TIME],
-            ids=worlds,
-        )
+        with PROFILER_RESTS:
+            records = batch.rollout(
+                commands.shape[1],
+                control=commands if self._model.nu else None,
+                control_spec=int(mujoco.mjtState.mjSTATE_CTRL),
+                record=[*fields, mujoco.mjtState.mjSTATE_TIME],
+                ids=worlds,
+            )
         start = {"qpos": starts.qpos, "qvel": starts.qvel}
         series = {}
         for field in fields:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from simopt_envs.physics.parameters import Array, ParameterSpace
+from simopt_envs.physics.profiler import PROFILER_RESTS
 from simopt_envs.physics.writer import ModelWriter, model_field
 
 _POSITIONS = int(mujoco.mjtStage.mjSTAGE_POS)
@@ -191,7 +192,8 @@ class BatchSimulation:
         self._batch.bind("ctrl")[:] = ctrl
         failed = np.zeros(self.num_worlds, dtype=bool)
         try:
-            self._batch.step(nstep=substeps, stage=_POSITIONS)
+            with PROFILER_RESTS:
+                self._batch.step(nstep=substeps, stage=_POSITIONS)
         except SimulationError as error:
             failed[error.ids] = True
         return failed | (self._warnings() != before)

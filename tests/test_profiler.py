@@ -1,0 +1,67 @@
+"""MuJoCo's profiler rests while many worlds step, and works as before for everybody else."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from threading import Thread
+
+import gymnasium as gym
+import mujoco
+import pytest
+from conftest import needs_batch
+
+from simopt_envs.physics.profiler import PROFILER_RESTS
+
+
+@pytest.fixture(scope="module")
+def timed() -> Callable[[], bool]:
+    """Whether a step is timed; by MuJoCo before 4 none is."""
+    model = mujoco.MjModel.from_xml_string("<mujoco/>")
+
+    def timed() -> bool:
+        data = mujoco.MjData(model)
+        mujoco.mj_step(model, data)
+        return data.timer[mujoco.mjtTimer.mjTIMER_STEP].duration > 0
+
+    if not timed():
+        pytest.skip(f"MuJoCo {mujoco.__version__} times nothing")
+    return timed
+
+
+def test_no_step_is_timed_meanwhile(timed):
+    with PROFILER_RESTS:
+        assert not timed()
+        with PROFILER_RESTS:
+            pass
+        assert not timed()
+    assert timed()
+
+
+def test_the_last_of_several_threads_lets_it_go_on(timed):
+    def enter_and_leave() -> None:
+        with PROFILER_RESTS:
+            pass
+
+    with PROFILER_RESTS:
+        other = Thread(target=enter_and_leave)
+        other.start()
+        other.join()
+        assert not timed()
+    assert timed()
+
+
+def test_steps_are_timed_again_after_an_error(timed):
+    with pytest.raises(RuntimeError), PROFILER_RESTS:
+        raise RuntimeError
+    assert timed()
+
+
+@needs_batch
+def test_worlds_are_not_timed_and_whatever_steps_afterwards_is(timed):
+    env = gym.make_vec("SimOpt/Drawer-v0", num_envs=2)
+    env.reset(seed=0)
+    env.step(env.action_space.sample())
+    _, data = env.unwrapped.simulation.world(0)
+    assert data.timer[mujoco.mjtTimer.mjTIMER_STEP].duration == 0
+    env.close()
+    assert timed()
