@@ -5,7 +5,8 @@
 All figures are ratios taken in one run. Two comparisons:
 
 * MuJoCo steps per CPU-second of the vector environment, a ξ per world, over those of a loop around ``mj_step`` through
-  the same worlds: same models, initial states and commands. What is missing to 1 is observation, reward and Python.
+  the same worlds: same models, initial states and commands, and without MuJoCo's profiler, too. What is missing to 1
+  is observation, reward and Python.
 * Control steps per second over those of Gymnasium's AsyncVectorEnv and Stable-Baselines3's SubprocVecEnv, with the
   number of workers that suits them best.
 """
@@ -25,6 +26,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv
 
 import simopt_envs  # noqa: F401 - registers the environments
 from simopt_envs.distributions import Gaussian
+from simopt_envs.physics.profiler import PROFILER_RESTS
 from wrappers import DistributionVectorWrapper
 
 STEPS = 50
@@ -70,7 +72,8 @@ def batched_and_raw(env_id: str, num_envs: int) -> tuple[float, float]:
     for i, (model, data) in enumerate(worlds):
         for command in commands:
             data.ctrl[:] = command[i]
-            mujoco.mj_step(model, data, substeps)
+            with PROFILER_RESTS:
+                mujoco.mj_step(model, data, substeps)
     raw = time.process_time() - start
     for (_, data), final in zip(worlds, finals, strict=True):
         np.testing.assert_allclose(data.qpos, final, atol=1e-9)  # the same worlds indeed
