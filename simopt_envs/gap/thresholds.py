@@ -30,7 +30,7 @@ earns ``EVIDENCE_EACH`` by a coarse fit, not ``EVIDENCE``, is fitted in full (on
 29000 had, the first three of the screen are fitted in full, from half of ``EVIDENCE`` on, where it was the first, from
 all of it (one case of seeds 28000), and no rivals are tried once ``MOST_EFFECTS`` have given way (one case). Since
 then, too, ``LEAST_SHARE`` is of the excess of all windows, not of those held out alone (one case each of seeds 25000
-and 26000).
+and 26000). Since seeds 30000 had, ``LEFT_SHARE`` is asked only of more than what noise may leave (two cases).
 
 What fitted values must be for an effect's name to fit them is with the effects (``Effect.is_itself``): that a cogging
 shows a whole period is asked since seeds 20000 had been run (one case, and one of the gap demonstration).
@@ -68,8 +68,8 @@ FURTHER = 0.02
 or takes most of what is left (``LEFT_SHARE``)."""
 
 LEFT_SHARE = 0.8
-"""Share of the held-out excess left so far that a further effect may take instead of ``FURTHER``: of what a law of
-another form leaves, one effect is taken not to explain so much."""
+"""Share of the held-out excess left so far that a further effect may take instead of ``FURTHER``, if that is more than
+noise may leave: of what a law of another form leaves, one effect is taken not to explain so much."""
 
 LEAST_SHARE = 0.35
 """Share of the excess, of windows fitted and held out together, that the effects must take away, or make the median
