@@ -80,9 +80,9 @@ def chosen(null: Base, base: Base, scores: Sequence[Score]) -> Score | None:
 
     A law of slightly another form than the true one leaves an error that nothing in the library describes, but much of
     it bends a little. So a further effect must make the model right, to what noise is, or explain a share of what the
-    ones before it did, or most of what they left, if that is more than noise may leave. Where even the best leaves more than noise, a simpler one that takes,
-    and leaves, nearly as much is as good. Where the best makes the model right, one that does not is not that law in
-    another form; and its form takes no more nats from a law than what it leaves.
+    ones before it did, or most of what they left, if that is more than noise may leave. Where even the best leaves more
+    than noise, a simpler one that takes, and leaves, nearly as much is as good. Where the best makes the model right,
+    one that does not is not that law in another form; and its form takes no more nats from a law than what it leaves.
     """
     earned, right = [score for score in scores if score.earned], EXPLAINED - 1
     if base is not null:
