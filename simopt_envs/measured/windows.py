@@ -237,6 +237,11 @@ def _is_usable(recording: Recording, grid: Recording, start: int, end: int) -> b
 
 def _check_columns(model: mujoco.MjModel, recording: Recording, first: Recording, known: dict[str, Channel]) -> None:
     """Raise ValueError where a recording cannot be replayed."""
+    if unnamed := [str(i) for i in range(model.nu) if not model.actuator(i).name]:
+        raise ValueError(
+            f"the model's actuators {', '.join(unnamed)} have no name; commands are read from columns ctrl/NAME: give"
+            " them names in the MJCF"
+        )
     if missing := [
         model.actuator(i).name for i in range(model.nu) if f"ctrl/{model.actuator(i).name}" not in recording.columns
     ]:
