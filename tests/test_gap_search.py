@@ -13,6 +13,7 @@ from gap_plant import MODEL, Law, record
 
 from simopt_envs.engine import LocalEngine
 from simopt_envs.gap import fit as fits
+from simopt_envs.gap import screen as screens
 from simopt_envs.gap import search as searches
 from simopt_envs.gap.explanation import ranked
 from simopt_envs.gap.fit import CONFIRMING, DIFFERENCES, Misfit
@@ -63,7 +64,7 @@ def test_only_probes_that_hardly_show_are_tried_larger_too():
 @pytest.mark.parametrize("size", [0.0, 0.2])
 def test_what_takes_much_of_held_out_errors_is_fitted_wherever_the_screen_has_it(monkeypatch, size):
     """Dry friction, which the screen is made to have last; without friction the first candidate alone is fitted."""
-    monkeypatch.setattr(searches, "REFITTED", 1)
+    monkeypatch.setattr(screens, "REFITTED", 1)
     monkeypatch.setattr(searches, "REFITTED_AT_MOST", 1)
     monkeypatch.setattr(searches, "screen", lambda *given: screen(*given)[::-1])
     search = _search(lambda q, v: np.array([0.0, -size * np.tanh(v[1] / 0.01)]), (SPRING, COGGING, PUSH, DRY))
@@ -75,6 +76,45 @@ def test_what_takes_much_of_held_out_errors_is_fitted_wherever_the_screen_has_it
         assert stage.screened[-1].candidate == DRY
     else:
         assert set(stage.trials) == {stage.screened[0].candidate}
+
+
+@pytest.mark.parametrize(
+    ("push", "size", "fitted"),
+    [
+        (3.0, 0.0, [3]),  # no further effect could be taken: none is tried
+        (3.0, 0.3, [3, 2]),  # of three
+        (0.5, 0.0, [3, 1]),  # one could be, but little speaks for any
+        (0.5, 0.05, [3, 2, 1]),
+    ],
+)
+def test_where_noise_alone_may_be_left_little_is_tried_or_nothing(push, size, fitted):
+    """How many candidates are fitted at each stage where a constant force is hidden, and a friction with it or not."""
+    search = _search(lambda q, v: np.array([-push, -size * np.tanh(v[1] / 0.01)]), (DRY, COGGING, PUSH))
+    found = search.run()
+    assert [len(stage.scores) for stage in found.stages] == fitted
+    assert {score.candidate for score in found.effects} == ({PUSH, DRY} if size else {PUSH})
+
+
+@pytest.mark.parametrize(("candidate", "alike"), [(DRY, True), (COGGING, False)])
+def test_of_a_model_that_is_built_alike_the_base_is_not_simulated_again(monkeypatch, candidate, alike):
+    search = _search(lambda q, v: np.zeros(2), (candidate,))
+    base = search.base()
+    hypothesis = Hypothesis(search.plain, (candidate,), search.motion)
+    assert hypothesis.is_built_as(base.hypothesis) is alike
+    _, changes = made_by_probes(hypothesis, base, search.data.fitted, 1)
+    monkeypatch.setattr(Hypothesis, "is_built_as", lambda *_: False)
+    np.testing.assert_array_equal(made_by_probes(hypothesis, base, search.data.fitted, 1)[1], changes)
+
+
+def test_the_sensors_noise_is_told_with_what_explains_errors_that_looked_like_it():
+    """The elbow's, which friction makes stop and go within a sample."""
+    smooth, rough = (
+        _search(lambda q, v, size=size: np.array([0.0, -size * np.tanh(v[1] / 0.01)]), (DRY,)).run()
+        for size in (0.0, 1.0)
+    )
+    expected, before, after = (base.sensor_noise for base in (smooth.null, rough.null, rough.final))
+    assert before[1] > 1.2 * expected[1]
+    np.testing.assert_allclose(after, expected, rtol=0.01)
 
 
 def test_a_fit_does_not_end_in_the_period_that_its_best_start_is_near():

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
+from simopt_envs.adaptation.fitting import Noise
+from simopt_envs.gap.fit import Fit
 from simopt_envs.gap.hypothesis import Candidate
 from simopt_envs.gap.large import of_several_effects
+from simopt_envs.gap.predictive import HeldOut
 from simopt_envs.gap.recordings import split
 from simopt_envs.gap.result import judge
-from simopt_envs.gap.selection import Score, chosen, may_be_itself, tolerance_of
+from simopt_envs.gap.selection import Score, chosen, is_all, may_be_itself, tolerance_of
 from simopt_envs.gap.trial import Base
 from simopt_envs.measured import Recording
 from simopt_envs.physics.effects import EFFECTS
@@ -133,6 +136,28 @@ def test_a_further_effect_that_takes_most_of_what_is_left_is_no_error_of_form(le
     base: Any = SimpleNamespace(excess=left, held_out=SimpleNamespace(errors=np.empty((40, 50, 2))))
     score = _score(5, after, 387.0)
     assert chosen(null, base, [score]) is (score if taken else None)
+
+
+@pytest.mark.parametrize(
+    ("removed", "left", "farthest", "whole"),
+    [
+        (390.0, 0.01, 1.0, True),
+        (390.0, 0.07, 1.0, False),  # more than noise may leave of 4000 errors: most of it may be taken
+        (2.0, 0.01, 1.0, False),  # two per cent of what was removed may be there
+        (390.0, 0.01, 3.6, False),  # a plain parameter speaks for another effect
+        (390.0, 0.01, 3.0, False),  # none does alone, but four together
+    ],
+)
+def test_no_further_effect_is_looked_for_where_none_could_be_chosen(removed, left, farthest, whole):
+    u, errors = np.array([farthest, 2.0, -farthest, 2.5, 0.3]), np.full((40, 50, 2), np.sqrt(1 + left))
+    told = HeldOut(errors, np.zeros((*errors.shape, 5)), np.zeros(40))
+    fit = Fit(u, errors, np.zeros((errors.size, 5)), np.ones(5), np.zeros(40))
+    hypothesis, noise = SimpleNamespace(num_plain=4), Noise.of(np.ones(2), np.zeros((1, *errors.shape)))
+    base = Base(cast(Any, hypothesis), fit, told, noise, noise, np.ones(2))
+    null: Any = SimpleNamespace(excess=left + removed)
+    assert is_all(null, base) is whole
+    ended = _score(5, -0.03, 60.0)
+    assert not whole or chosen(null, base, [ended]) is None
 
 
 @pytest.mark.parametrize(("fitted", "simple_wins"), [(15.0, False), (23.0, True)])

@@ -10,8 +10,8 @@ import numpy as np
 from simopt_envs.engine import Engine, counted
 from simopt_envs.gap.fit import Misfit
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
-from simopt_envs.gap.thresholds import EVIDENCE, FORETELLING, FORETOLD, PROBED_LARGER
-from simopt_envs.gap.trial import Base
+from simopt_envs.gap.thresholds import EVIDENCE, FORETELLING, FORETOLD, PROBED_LARGER, REFITTED
+from simopt_envs.gap.trial import Base, noise_alone
 from simopt_envs.measured.windows import Windows
 from simopt_envs.physics.parameters import Array
 
@@ -64,6 +64,11 @@ def screen(
     return sorted(found, key=lambda s: price * len(s.hypothesis.columns[s.candidate]) - s.gain)
 
 
+def fitted_anyway(base: Base) -> int:
+    """How many of the first of a screen are fitted in any case: one, where effects have left no more than noise may."""
+    return 1 if base.hypothesis.candidates and base.excess < noise_alone(base) else REFITTED
+
+
 def made_by_probes(hypothesis: Hypothesis, base: Base, windows: Windows, num_threads: int) -> tuple[Array, Array]:
     """The probes (n, d) of a hypothesis' last candidate, and what each changes in a base's errors, (n, w, S, c).
 
@@ -76,15 +81,16 @@ def made_by_probes(hypothesis: Hypothesis, base: Base, windows: Windows, num_thr
     without[: len(base.fit.u)] = base.fit.u
     probes = hypothesis.probes(candidate)
     probes[:, : len(base.fit.u)] = base.fit.u
-    errors = misfit.errors(np.concatenate([without[None], probes]))  # a structure alone changes a little
-    changes = errors[1:] - errors[0]
+    is_built_alike = hypothesis.is_built_as(base.hypothesis)  # or its structure alone changes a little
+    here = base.fit.errors if is_built_alike else misfit.errors(without[None])[0]
+    changes = misfit.errors(probes) - here
     small = np.linalg.norm(changes.reshape(len(probes), -1), axis=1) < _LEAST_CHANGE
     if not small.any():
         return probes, changes
     amounts, larger = hypothesis.amounts(candidate), probes[small]
     larger[:, amounts] += (PROBED_LARGER - 1) * (larger - without)[:, amounts]
     larger = np.clip(larger, hypothesis.low, hypothesis.high)
-    return np.concatenate([probes, larger]), np.concatenate([changes, misfit.errors(larger) - errors[0]])
+    return np.concatenate([probes, larger]), np.concatenate([changes, misfit.errors(larger) - here])
 
 
 def foretelling(base: Base, screened: Sequence[Screened], windows: Windows, engine: Engine) -> list[Candidate]:

@@ -21,17 +21,9 @@ from simopt_envs.gap.outliers import without_outliers
 from simopt_envs.gap.plain import SPEAKS_FOR, Plain
 from simopt_envs.gap.predictive import HeldOut
 from simopt_envs.gap.refit import ITERATIONS, Refit, extended, fitted, grown, spoken_for
-from simopt_envs.gap.screen import Screened, foretelling, screen
-from simopt_envs.gap.selection import Score, chosen, is_there, may_be_itself, score_of, tolerance_of, worth_of
-from simopt_envs.gap.thresholds import (
-    EVIDENCE,
-    EVIDENCE_EACH,
-    LARGE,
-    LARGE_REFITTED,
-    MOST_EFFECTS,
-    REFITTED,
-    REFITTED_AT_MOST,
-)
+from simopt_envs.gap.screen import Screened, fitted_anyway, foretelling, screen
+from simopt_envs.gap.selection import Score, chosen, is_all, is_there, may_be_itself, score_of, tolerance_of, worth_of
+from simopt_envs.gap.thresholds import EVIDENCE, EVIDENCE_EACH, LARGE, LARGE_REFITTED, MOST_EFFECTS, REFITTED_AT_MOST
 from simopt_envs.gap.trial import Base, Data, Trial, afresh
 from simopt_envs.gap.wild_starts import as_predicted, without_starts_told_wild
 from simopt_envs.physics.effects import Motion
@@ -76,8 +68,8 @@ class Search:
         self._longer, self._progress, self._engine = tuple(longer), progress, engine or ThreadEngine()
         self._kept = kept_fits(directory, plain, motion, data.fitted, data.held_out)
         self._null = null
-        self._floor: Array | None = None if null is None else null.sensor_noise
         self._tolerance = np.ones(len(data.fitted.channels))
+        self._floor = np.inf * self._tolerance if null is None else null.sensor_noise
         self._largest: dict[tuple[Candidate, ...], list[Candidate]] = {}
 
     def run(self) -> Explanation:
@@ -99,6 +91,7 @@ class Search:
 
     def _grown(self, stages: list[Stage], stage: Stage, dropped: frozenset[Candidate] = frozenset()) -> Base:
         """A stage's base with effects added while they earn it, but for those that were dropped; stages are noted."""
+        most = min(MOST_EFFECTS, len(self.candidates))
         while True:
             stage = self._polished(stage)
             stages.append(replace(stage, scores=tuple(s for s in stage.scores if s.candidate not in dropped)))
@@ -106,7 +99,7 @@ class Search:
             if best is None:
                 return stage.base
             base = self._contested(stages, self._sharpened(best.trial), best.candidate)
-            if len(base.hypothesis.candidates) == min(MOST_EFFECTS, len(self.candidates)):
+            if len(base.hypothesis.candidates) == most or is_all(stages[0].base, base):
                 return base
             stage = self.stage(base)
 
@@ -155,7 +148,7 @@ class Search:
         hypothesis = Hypothesis(self.plain, effects, self.motion)
         u, differences = (hypothesis.neutral(), DIFFERENCES) if start is None else (start, DIFFERENCES[1:])
         fitted, held_out = (Misfit(hypothesis, w) for w in (self.data.fitted, self.data.held_out))
-        if self._floor is None:  # what the first fit leaves is nearer to noise alone than what the model as given does
+        if np.isinf(self._floor).all():  # what a first fit leaves is nearer to noise than what the model as given does
             self._progress("fit", 0, 2)
             floor = fitted.noise_floor(u)
             u, differences = self.fit(fitted.with_noise(fitted.noise_at(u, floor)), u, differences).u, DIFFERENCES[1:]
@@ -170,9 +163,10 @@ class Search:
     def _sharpened(self, trial: Trial) -> Base:
         """A trial's hypothesis as a base: fitted to the sensors' noise or, where that leaves far more, to what is left.
 
-        What the trial itself left was of a fit in the noise of a base that lacked the effect.
+        What the trial itself left was of a fit in the noise of a base that lacked the effect, which looked too large.
         """
         effects, usual = trial.hypothesis.candidates, trial.hypothesis.usual
+        self._floor = np.minimum(self._floor, Misfit(trial.hypothesis, self.data.fitted).noise_floor(trial.fit.u))
         self._tolerance = np.ones(len(self._tolerance))
         base = self.base(effects, usual(trial.fit.u))
         best = min(trial, base, key=lambda t: t.excess)
@@ -194,16 +188,16 @@ class Search:
     def stage(self, base: Base, look: Stage | None = None, before: Stage | None = None) -> Stage:
         """Screen all candidates, and fit the best, by what was held out too, but those that a look there has fitted.
 
-        The best of a stage before, from another fit of the base, are fitted from where they ended there, too.
+        The best of a stage before, from another fit of the base, are fitted from where they ended there, too. Where
+        noise alone may be left, only what the screen has something of is.
         """
         screened = self._screened(base)
         done = {} if look is None else look.trials
         wanted = [*spoken_for(base, self.candidates), *self._large(base)]
         wanted += [s.candidate for s in screened[:REFITTED_AT_MOST] if s.gain > EVIDENCE_EACH]
         wanted += foretelling(base, screened, self.data.held_out, self._engine)
-        promising = screened[:REFITTED] + [s for s in screened[REFITTED:] if s.candidate in wanted]
-        refits = self._refits(base, [one for one in promising if one.candidate not in done])
-        trials = done | self.trials(base, refits)
+        promising = [s for i, s in enumerate(screened) if i < fitted_anyway(base) or s.candidate in wanted]
+        trials = done | self.trials(base, self._refits(base, [one for one in promising if one.candidate not in done]))
         return ranked(base, screened, self._in_full(base, screened, trials, done, before))
 
     def _refits(self, base: Base, promising: Sequence[Screened]) -> list[Refit]:

@@ -23,7 +23,7 @@ from simopt_envs.gap.thresholds import (
     SIMPLER_LEAVES,
     SIMPLER_SHARE,
 )
-from simopt_envs.gap.trial import Base, Trial
+from simopt_envs.gap.trial import Base, Trial, noise_alone
 from simopt_envs.physics.parameters import Array
 
 
@@ -87,7 +87,7 @@ def chosen(null: Base, base: Base, scores: Sequence[Score]) -> Score | None:
     earned, right = [score for score in scores if score.earned], EXPLAINED - 1
     if base is not null:
         least = FURTHER * (null.excess - base.excess)
-        if base.excess > CONFIDENT * np.sqrt(2 / base.held_out.errors.size):  # or noise alone may have left it
+        if base.excess > noise_alone(base):
             least = min(least, LEFT_SHARE * base.excess)
         earned = [
             s
@@ -110,6 +110,17 @@ def chosen(null: Base, base: Base, scores: Sequence[Score]) -> Score | None:
         s for s in earned if best.total - s.total < clearly(s) or enough > s.trial.excess > best.trial.excess > right
     ]
     return min(as_good, key=lambda score: (len(score.trial.fit.u), -score.total))
+
+
+def is_all(null: Base, base: Base) -> bool:
+    """Whether no further effect can be chosen, so that none need be tried.
+
+    What is left may be noise alone, and taking as much as one must would leave less than noise does. No plain parameter
+    speaks for one, nor do all of them together.
+    """
+    plain, noise = base.fit.u[: base.hypothesis.num_plain], noise_alone(base)
+    quiet = base.excess < noise and not base.strained and bool(np.all(np.abs(plain) < FAR))
+    return quiet and base.excess - FURTHER * (null.excess - base.excess) < -noise
 
 
 def worth_of(best: Trial) -> Array:

@@ -31,6 +31,8 @@ earns ``EVIDENCE_EACH`` by a coarse fit, not ``EVIDENCE``, is fitted in full (on
 all of it (one case of seeds 28000), and no rivals are tried once ``MOST_EFFECTS`` have given way (one case). Since
 then, too, ``LEAST_SHARE`` is of the excess of all windows, not of those held out alone (one case each of seeds 25000
 and 26000). Since seeds 30000 had, ``LEFT_SHARE`` is asked only of more than what noise may leave (two cases).
+Since seeds 31000 had, the noise is told with each effect anew (two cases), and ``REFITTED`` are fitted only where more
+than noise may be left, for time alone.
 
 What fitted values must be for an effect's name to fit them is with the effects (``Effect.is_itself``): that a cogging
 shows a whole period is asked since seeds 20000 had been run (one case, and one of the gap demonstration).
@@ -87,7 +89,7 @@ FARTHEST = 4.0
 prior alone costs nothing beside them, and parameters went 20 of its deviations to stand in for what is missing."""
 
 REFITTED = 6
-"""Candidates of the screen that are fitted in any case."""
+"""Candidates of the screen that are fitted in any case; one, where effects have left no more than noise may."""
 
 REFITTED_AT_MOST = 10
 """First candidates of the screen, of which those that gain ``EVIDENCE_EACH`` by it are fitted."""
