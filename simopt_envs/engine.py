@@ -114,10 +114,9 @@ class LocalEngine:
 class ThreadEngine(LocalEngine):
     """Does as many tasks at once as there are cores, each in a thread of this process.
 
-    It pays where tasks simulate much and in small batches: what one does in Python, others simulate meanwhile.
+    It pays where tasks simulate much and in small batches: what one does in Python, others simulate meanwhile. Each may
+    use all cores, or those of the tasks that have ended would idle until the last one has.
     """
-
-    num_threads = 1
 
     def _outcomes(
         self, function: Callable[..., R], tasks: Sequence[T], shared: tuple[object, ...]

@@ -26,7 +26,9 @@ from simopt_envs.gap.screen import made_by_probes, screen
 from simopt_envs.gap.search import Search
 from simopt_envs.gap.selection import is_there, score_of
 from simopt_envs.gap.thresholds import EVIDENCE, LARGE, PROBED_LARGER
+from simopt_envs.gap.trial import Base
 from simopt_envs.physics.effects import EFFECTS
+from simopt_envs.physics.parameters import Array
 
 pytestmark = needs_effects
 
@@ -46,18 +48,23 @@ def _search(forces: Law, candidates: Sequence[Candidate], limit: float | None = 
     return Search(plain, read_windows(plain.model, recordings), motion_of(plain.model, recordings), candidates)
 
 
+def _off(search: Search, base: Base) -> Array:
+    return Misfit(base.hypothesis, search.data.fitted).with_noise(base.noise).off(base.fit.u[None])[0]
+
+
 def test_only_probes_that_hardly_show_are_tried_larger_too():
     """Of plays of several sizes, those that change all errors together by too little to earn a name."""
     search = _search(lambda q, v: np.zeros(2), (PLAY,))
     hypothesis = Hypothesis(search.plain, (PLAY,), search.motion)
-    given = hypothesis.probes(PLAY)
-    probes, changes = made_by_probes(hypothesis, search.base(), search.data.fitted, 1)
-    changed = np.linalg.norm(changes.reshape(len(probes), -1), axis=1)
+    given, base = hypothesis.probes(PLAY), search.base()
+    probed = made_by_probes(hypothesis, base, _off(search, base), search.data.fitted, 1)
+    changed = np.linalg.norm(base.noise.whiten(probed.changes).reshape(len(probed.own), -1), axis=1)
     small = changed[: len(given)] < np.sqrt(2 * EVIDENCE)
     assert 0 < small.sum() < len(given)
-    amounts = hypothesis.amounts(PLAY)
-    np.testing.assert_allclose(probes[: len(given), amounts], given[:, amounts])
-    np.testing.assert_allclose(probes[len(given) :, amounts], PROBED_LARGER * given[small][:, amounts])
+    amounts = [hypothesis.columns[PLAY].index(i) for i in hypothesis.amounts(PLAY)]
+    given = given[:, hypothesis.columns[PLAY]]
+    np.testing.assert_allclose(probed.own[: len(given), amounts], given[:, amounts])
+    np.testing.assert_allclose(probed.own[len(given) :, amounts], PROBED_LARGER * given[small][:, amounts])
     assert np.all(changed[len(given) :] > 2 * changed[: len(given)][small])
 
 
@@ -101,9 +108,24 @@ def test_of_a_model_that_is_built_alike_the_base_is_not_simulated_again(monkeypa
     base = search.base()
     hypothesis = Hypothesis(search.plain, (candidate,), search.motion)
     assert hypothesis.is_built_as(base.hypothesis) is alike
-    _, changes = made_by_probes(hypothesis, base, search.data.fitted, 1)
+    given = hypothesis, base, _off(search, base), search.data.fitted, 1
+    changes = made_by_probes(*given).changes
     monkeypatch.setattr(Hypothesis, "is_built_as", lambda *_: False)
-    np.testing.assert_array_equal(made_by_probes(hypothesis, base, search.data.fitted, 1)[1], changes)
+    np.testing.assert_array_equal(made_by_probes(*given).changes, changes)
+
+
+@pytest.mark.parametrize("size", [0.0, 0.2])
+def test_a_screen_simulates_again_only_what_those_before_promise_something_of(size):
+    """Beside a constant force, once that is found: a friction, which other candidates can stand in for, or nothing."""
+    search = _search(lambda q, v: np.array([-3.0, -size * np.tanh(v[1] / 0.01)]), (DRY, SPRING, PUSH))
+    search._screened(search.base())
+    before, base = dict(search._probed), search.base((PUSH,))
+    gains = {one.candidate: one.gain for one in search._screened(base)}
+    again = {c for c in gains if search._probed[c] is not before[c]}
+    assert DRY in again if size else not again
+    search._probed.clear()
+    for one in search._screened(base):
+        assert gains[one.candidate] == pytest.approx(one.gain, rel=0.1, abs=0.5)
 
 
 def test_the_sensors_noise_is_told_with_what_explains_errors_that_looked_like_it():
@@ -274,7 +296,7 @@ def test_a_limit_is_there_where_it_acts(limit):
 def test_a_limit_promises_nothing_that_only_its_opposite_would_give(friction, limit):
     """Of dry friction, less than no limit at all would explain much, to first order."""
     search = _search(lambda q, v: np.array([0.0, -friction * np.tanh(v[1] / 0.01)]), (LIMIT,), limit)
-    (screened,) = screen(search.base(), (LIMIT,), search.data.fitted, LocalEngine(), lambda *_: None)
+    (screened,) = screen(search.base(), (LIMIT,), search.data.fitted, LocalEngine(), lambda *_: None, {})
     assert (screened.gain > EVIDENCE) == (limit is not None), screened.gain
 
 

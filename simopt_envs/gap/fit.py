@@ -160,12 +160,15 @@ class Misfit:
         """(n, d) -> (n, w, S, c)."""
         return self._simulate(self.hypothesis.xi(u))
 
-    def errors(self, u: Array) -> Array:
-        """Whitened errors, (n, d) -> (n, w, S, c)."""
+    def off(self, u: Array) -> Array:
+        """Simulated less measured, (n, d) -> (n, w, S, c); 0 where nothing was measured."""
         errors = self.simulated(u) - self._measured
         diverged = np.isnan(errors) & self._counted
-        errors = np.where(diverged, _DIVERGED * self.noise.scale, np.where(self._counted, errors, 0.0))
-        return self.noise.whiten(errors)
+        return np.where(diverged, _DIVERGED * self.noise.scale, np.where(self._counted, errors, 0.0))
+
+    def errors(self, u: Array) -> Array:
+        """Whitened errors, (n, d) -> (n, w, S, c)."""
+        return self.noise.whiten(self.off(u))
 
     def best(self, starts: Array) -> Array:
         """The start (d,), of several (k, d), from which a fit has the least left to do."""
@@ -351,7 +354,10 @@ def _descended(
     iterations: int,
     least: float = _LEAST_GAIN,
 ) -> Array:
-    """Where steps downhill lead, with derivatives over one difference: to where those taken there gain no more."""
+    """Where steps downhill lead, with derivatives over one difference: to where those taken there gain no more.
+
+    Where a finer difference follows, they are not taken there once more to see: from there on, it takes its own.
+    """
 
     def stop(trace: Sequence[minimize.IterLog]) -> None:
         # MuJoCo's own test is of steps relative to the length of x: far from 0, where effects are large, it ends early.
@@ -378,7 +384,7 @@ def _descended(
         except _NothingLeft as end:
             x, trace = end.args
         x = np.ravel(x)
-        if derivatives.are_taken(x):
+        if derivatives.are_taken(x) or least > _LEAST_GAIN:
             break
         iterations -= len(trace)  # derivatives from before damp steps that those taken would not
     return x

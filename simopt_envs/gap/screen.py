@@ -22,6 +22,19 @@ _LEAST_CHANGE = np.sqrt(2 * EVIDENCE)  # of the errors together, in standard dev
 
 
 @dataclass(frozen=True)
+class Probed:
+    """What the probes of a candidate change on some windows.
+
+    Attributes:
+        own: its parameters' coordinates, (n, k).
+        changes: of what is simulated, (n, w, S, c), in the channels' units.
+    """
+
+    own: Array
+    changes: Array
+
+
+@dataclass(frozen=True)
 class Screened:
     """A candidate that acts linearly.
 
@@ -41,11 +54,17 @@ class Screened:
 
 
 def screen(
-    base: Base, candidates: Sequence[Candidate], windows: Windows, engine: Engine, progress: Callable[[int, int], None]
+    base: Base,
+    candidates: Sequence[Candidate],
+    windows: Windows,
+    engine: Engine,
+    progress: Callable[[int, int], None],
+    probed: dict[Candidate, Probed],
 ) -> list[Screened]:
     """The candidates that a base lacks, largest expected gain less the price of their parameters (BIC) first.
 
-    By the gain alone, those that have a shape to choose would crowd out others that need none.
+    By the gain alone, those that have a shape to choose would crowd out others that need none. What a probe changes
+    differs little from one base to another, so that one of which it promises next to nothing is not simulated again.
 
     Args:
         base: what they are added to.
@@ -53,13 +72,19 @@ def screen(
         windows: that the base was fitted to.
         engine: screens them.
         progress: is told how many of how many are done.
+        probed: what is known of these windows from screens before, with other bases; what is found now is put there.
     """
     plain, effects, motion = base.hypothesis.plain, base.hypothesis.candidates, base.hypothesis.motion
-    lacking = [c for c in candidates if c not in effects]
-    hypotheses = [Hypothesis(plain, [*effects, c], motion) for c in lacking]
-    shared = base, windows, engine.num_threads
-    made = engine.map(made_by_probes, hypotheses, shared, counted(progress, len(lacking)))
-    found = [_screened(hypothesis, *one, base) for hypothesis, one in zip(hypotheses, made, strict=True)]
+    hypotheses = {c: Hypothesis(plain, [*effects, c], motion) for c in candidates if c not in effects}
+    known = {c: _screened(h, probed[c], base) for c, h in hypotheses.items() if c in probed}
+    anew = [h for c, h in hypotheses.items() if c not in known or known[c].gain > FORETOLD]
+    here = Misfit(base.hypothesis, windows).with_noise(base.noise).off(base.fit.u[None])[0]
+    note = counted(progress, len(hypotheses), len(hypotheses) - len(anew))
+    made = engine.map(made_by_probes, anew, (base, here, windows, engine.num_threads), note)
+    for hypothesis, one in zip(anew, made, strict=True):
+        candidate = hypothesis.candidates[-1]
+        probed[candidate], known[candidate] = one, _screened(hypothesis, one, base)
+    found = [known[c] for c in hypotheses]
     price = 0.5 * np.log(base.fit.errors.size)
     return sorted(found, key=lambda s: price * len(s.hypothesis.columns[s.candidate]) - s.gain)
 
@@ -69,28 +94,29 @@ def fitted_anyway(base: Base) -> int:
     return 1 if base.hypothesis.candidates and base.excess < noise_alone(base) else REFITTED
 
 
-def made_by_probes(hypothesis: Hypothesis, base: Base, windows: Windows, num_threads: int) -> tuple[Array, Array]:
-    """The probes (n, d) of a hypothesis' last candidate, and what each changes in a base's errors, (n, w, S, c).
+def made_by_probes(hypothesis: Hypothesis, base: Base, here: Array, windows: Windows, num_threads: int) -> Probed:
+    """What the probes of a hypothesis' last candidate change in what a base is off, ``here`` (w, S, c).
 
     Of one that changes less than an effect must to earn its name, a larger one is a probe, too: where things touch,
     what is smaller than that drowns in what any change of the model does.
     """
-    candidate = hypothesis.candidates[-1]
+    candidate, first = hypothesis.candidates[-1], len(base.fit.u)
     misfit = Misfit(hypothesis, windows, num_threads).with_noise(base.noise)
     without = hypothesis.neutral()
-    without[: len(base.fit.u)] = base.fit.u
+    without[:first] = base.fit.u
     probes = hypothesis.probes(candidate)
-    probes[:, : len(base.fit.u)] = base.fit.u
-    is_built_alike = hypothesis.is_built_as(base.hypothesis)  # or its structure alone changes a little
-    here = base.fit.errors if is_built_alike else misfit.errors(without[None])[0]
-    changes = misfit.errors(probes) - here
-    small = np.linalg.norm(changes.reshape(len(probes), -1), axis=1) < _LEAST_CHANGE
+    probes[:, :first] = base.fit.u
+    if not hypothesis.is_built_as(base.hypothesis):  # its structure alone changes a little
+        here = misfit.off(without[None])[0]
+    changes = misfit.off(probes) - here
+    small = np.linalg.norm(base.noise.whiten(changes).reshape(len(probes), -1), axis=1) < _LEAST_CHANGE
     if not small.any():
-        return probes, changes
+        return Probed(probes[:, first:], changes)
     amounts, larger = hypothesis.amounts(candidate), probes[small]
     larger[:, amounts] += (PROBED_LARGER - 1) * (larger - without)[:, amounts]
     larger = np.clip(larger, hypothesis.low, hypothesis.high)
-    return np.concatenate([probes, larger]), np.concatenate([changes, misfit.errors(larger) - here])
+    changes = np.concatenate([changes, misfit.off(larger) - here])
+    return Probed(np.concatenate([probes, larger])[:, first:], changes)
 
 
 def foretelling(base: Base, screened: Sequence[Screened], windows: Windows, engine: Engine) -> list[Candidate]:
@@ -110,13 +136,14 @@ def _least_left(screened: Screened, base: Base, windows: Windows, num_threads: i
     return float(np.sum(misfit.errors(screened.starts[:, 0]) ** 2, axis=(1, 2, 3)).min())
 
 
-def _screened(hypothesis: Hypothesis, probes: Array, changes: Array, base: Base) -> Screened:
+def _screened(hypothesis: Hypothesis, probed: Probed, base: Base) -> Screened:
     """What a hypothesis' last candidate would gain if its best probe acted linearly."""
     candidate = hypothesis.candidates[-1]
+    probes = np.hstack([np.tile(base.fit.u, (len(probed.own), 1)), probed.own])
     amounts, neutral = hypothesis.amounts(candidate), hypothesis.neutral()
     residual, (orthonormal, triangle) = base.fit.residual, base.fit.orthonormal
     found: list[Screened] = []
-    for probe, change_of_data in zip(probes, changes, strict=True):
+    for probe, change_of_data in zip(probes, base.noise.whiten(probed.changes), strict=True):
         change = np.concatenate([change_of_data.ravel(), np.zeros(len(base.fit.u))])
         absorbed = orthonormal.T @ change
         direction = change - orthonormal @ absorbed

@@ -21,7 +21,7 @@ from simopt_envs.gap.outliers import without_outliers
 from simopt_envs.gap.plain import SPEAKS_FOR, Plain
 from simopt_envs.gap.predictive import HeldOut
 from simopt_envs.gap.refit import ITERATIONS, Refit, extended, fitted, grown, spoken_for
-from simopt_envs.gap.screen import Screened, fitted_anyway, foretelling, screen
+from simopt_envs.gap.screen import Probed, Screened, fitted_anyway, foretelling, screen
 from simopt_envs.gap.selection import Score, chosen, is_all, is_there, may_be_itself, score_of, tolerance_of, worth_of
 from simopt_envs.gap.thresholds import EVIDENCE, EVIDENCE_EACH, LARGE, LARGE_REFITTED, MOST_EFFECTS, REFITTED_AT_MOST
 from simopt_envs.gap.trial import Base, Data, Trial, afresh
@@ -71,6 +71,7 @@ class Search:
         self._tolerance = np.ones(len(data.fitted.channels))
         self._floor = np.inf * self._tolerance if null is None else null.sensor_noise
         self._largest: dict[tuple[Candidate, ...], list[Candidate]] = {}
+        self._probed: dict[Candidate, Probed] = {}
 
     def run(self) -> Explanation:
         """Add effects while they earn it, then take away those that the others have made needless.
@@ -140,6 +141,7 @@ class Search:
             return stage
         if self.data.fitted is not before.fitted:
             self._largest.clear()
+            self._probed.clear()
             return None
         return stage.held_against(before.held_out.find(self.data.held_out))
 
@@ -211,7 +213,8 @@ class Search:
     def _screened(self, base: Base, candidates: Sequence[Candidate] | None = None) -> list[Screened]:
         """All candidates, or some, as they would act on a base."""
         screened = self.candidates if candidates is None else candidates
-        return screen(base, screened, self.data.fitted, self._engine, partial(self._progress, "screen"))
+        note = partial(self._progress, "screen")
+        return screen(base, screened, self.data.fitted, self._engine, note, self._probed)
 
     def _polished(self, stage: Stage) -> Stage:
         """A stage from the base fitted from where candidates led its parameters, if it comes out better there.

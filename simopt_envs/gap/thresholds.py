@@ -32,7 +32,8 @@ all of it (one case of seeds 28000), and no rivals are tried once ``MOST_EFFECTS
 then, too, ``LEAST_SHARE`` is of the excess of all windows, not of those held out alone (one case each of seeds 25000
 and 26000). Since seeds 30000 had, ``LEFT_SHARE`` is asked only of more than what noise may leave (two cases).
 Since seeds 31000 had, the noise is told with each effect anew (two cases), and ``REFITTED`` are fitted only where more
-than noise may be left, for time alone.
+than noise may be left, for time alone. Since seeds 32000 had, again for time alone, ``FORETOLD`` is asked of what is to
+be screened again with another base, too, and a coarse fit that a finer one follows takes no derivatives where it ends.
 
 What fitted values must be for an effect's name to fit them is with the effects (``Effect.is_itself``): that a cogging
 shows a whole period is asked since seeds 20000 had been run (one case, and one of the gap demonstration).
@@ -95,7 +96,8 @@ REFITTED_AT_MOST = 10
 """First candidates of the screen, of which those that gain ``EVIDENCE_EACH`` by it are fitted."""
 
 FORETOLD = 1.0
-"""Nats that a candidate must gain by the screen to be tried on the windows held out, too."""
+"""Nats that a candidate must gain by the screen to be tried on the windows held out, too, and, by the screen of an
+earlier base, to be simulated in the next."""
 
 FORETELLING = 3
 """Candidates that are fitted for what they take there, if that is ``EVIDENCE``, wherever the screen has them."""
