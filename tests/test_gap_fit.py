@@ -16,6 +16,7 @@ from simopt_envs.gap import fit as fits
 from simopt_envs.gap import looks
 from simopt_envs.gap.chart import Chart
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
+from simopt_envs.gap.known import completed, of_silent
 from simopt_envs.gap.large import of_some_size
 from simopt_envs.gap.motion import motion_of
 from simopt_envs.gap.plain import plain_parameters
@@ -196,3 +197,31 @@ def test_a_fit_takes_no_derivatives_where_all_are_known(arm, monkeypatch):
     found = fits.fit(misfit, off, 20, right.jacobian, (0.1,))
     assert misfit.losses(off[None])[0] > 20 * right.loss
     assert found.loss == pytest.approx(right.loss, abs=0.5)
+
+
+def test_a_fit_takes_no_derivatives_by_plain_parameters_that_hardly_show(arm, monkeypatch):
+    """It ends where one ends that takes all of them."""
+    hypothesis, misfit = arm
+    start = _at(hypothesis, STIFFNESS, REST)
+    misfit = misfit.with_noise(misfit.noise_at(start, np.array([5e-2, 5e-2, 1e-1, 1e-1, 1e-1])))
+    off = np.clip(start + 0.1, hypothesis.low, hypothesis.high)
+    right = fits.fit(misfit, off, 20, differences=(0.1,))
+    known = of_silent(misfit.jacobian(off), hypothesis.num_plain)
+    silent = np.isfinite(known).all(axis=0)
+    assert 0 < np.sum(silent) < hypothesis.num_plain
+    taken = set()
+    jacobian = fits.Misfit.jacobian
+    monkeypatch.setattr(fits.Misfit, "jacobian", lambda m, u, c, *more: taken.update(c) or jacobian(m, u, c, *more))
+    found = fits.fit(misfit, off, 20, known, (0.1,))
+    assert taken == set(np.flatnonzero(~silent))
+    assert found.loss == pytest.approx(right.loss, abs=0.05)
+    np.testing.assert_allclose(found.u, right.u, atol=0.05)
+
+
+def test_the_shape_of_an_effect_is_taken_though_it_does_not_show():
+    """Where there is none of it, it does not, and may where there is some."""
+    jacobian = np.array([[1.0, 0.1, 0.0], [2.0, 0.1, 0.0]])
+    np.testing.assert_array_equal(of_silent(jacobian, 2), [[np.nan, 0.1, np.nan], [np.nan, 0.1, np.nan]])
+    taken = completed(of_silent(jacobian, 2), 4, lambda columns: np.tile(columns, (2, 1)))
+    np.testing.assert_array_equal(taken, [[0, 0.1, 2, 3], [0, 0.1, 2, 3]])
+    np.testing.assert_array_equal(completed(None, 2, lambda columns: np.tile(columns, (2, 1))), [[0, 1], [0, 1]])

@@ -236,6 +236,40 @@ def test_joints_without_a_column_are_found_from_sites_and_sensors():
     ]
 
 
+def chain(links: int) -> mujoco.MjModel:
+    """A rope of links of 10 cm, with a site at its tip."""
+    tail = "<site name='tip' pos='0 0 -0.1'/>" + "</body>" * links
+    link = (
+        "<body pos='0 0 {z}'><joint name='link{i}' axis='0 1 0' damping='1e-4'/>"
+        "<geom type='capsule' fromto='0 0 0 0 0 -0.1' size='0.01' mass='0.02'/>"
+    )
+    bodies = "".join(link.format(i=i, z=-0.1 if i else 0.0) for i in range(links))
+    return mujoco.MjModel.from_xml_string(
+        f"<mujoco><option timestep='0.002'/><worldbody>{bodies}{tail}</worldbody></mujoco>"
+    )
+
+
+@pytest.mark.parametrize("links", [1, 6])
+def test_of_joints_that_one_site_tells_little_of_no_more_is_unknown_than_it_shows(links):
+    """Of a rope that swings, its tip tells where the joints are together, and so how far off each may be."""
+    model, rng, off, rates = chain(links), np.random.default_rng(0), [], []
+    samples = np.arange(50, 450, 50)
+    for _ in range(8):
+        data, rows = mujoco.MjData(model), []
+        data.qpos[:] = 0.05 * rng.standard_normal()  # bent as a whole, and let go
+        for _ in range(500):
+            mujoco.mj_kinematics(model, data)
+            rows.append(np.concatenate([data.qpos, data.qvel, data.site_xpos[0] + 1e-4 * rng.standard_normal(3)]))
+            mujoco.mj_step(model, data)
+        qpos, qvel, tip = np.split(np.array(rows), [links, 2 * links], axis=1)
+        columns = {f"site/tip/{axis}": values for axis, values in zip("xyz", tip.T, strict=True)}
+        states = estimate_states(model, Recording(0.002 * np.arange(500), columns), samples)
+        off.append((states.qpos - qpos[samples]) / states.qpos_error)
+        rates.append((states.qvel - centred(qvel)[samples]) / states.qvel_error)
+    assert 0.4 < np.std(off) < 1.6
+    assert 0.4 < np.std(rates) < 1.6
+
+
 def test_a_keyframe_replaces_the_reference():
     model = mujoco.MjModel.from_xml_string(
         CART.format(armature="").replace("<actuator>", '<keyframe><key name="up" qpos="0 3"/></keyframe><actuator>')

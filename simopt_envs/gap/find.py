@@ -28,7 +28,7 @@ from simopt_envs.gap.search import Progress, Search
 from simopt_envs.gap.separate import separate
 from simopt_envs.gap.sizes import of_best_length
 from simopt_envs.gap.trial import Base, Data
-from simopt_envs.gap.wild_starts import without_wild_starts
+from simopt_envs.gap.wild_starts import without_wild_columns, without_wild_starts
 from simopt_envs.measured.mapping import LogMapping
 from simopt_envs.measured.readers import load_recordings
 from simopt_envs.measured.recording import Recording
@@ -152,6 +152,7 @@ def _without_wild_starts(plain: Plain, data: Data, motion: Motion) -> Data:
     """Without those that the model as given tells."""
     hypothesis = Hypothesis(plain, (), motion)
     as_given = hypothesis.neutral()
+    data = without_wild_columns(hypothesis, as_given, data, Misfit(hypothesis, data.fitted).noise_floor(as_given))
     return without_wild_starts(hypothesis, as_given, data, Misfit(hypothesis, data.fitted).noise_floor(as_given))
 
 

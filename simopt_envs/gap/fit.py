@@ -16,6 +16,7 @@ from mujoco import minimize
 from simopt_envs.adaptation.fitting import Noise
 from simopt_envs.gap.chart import Chart
 from simopt_envs.gap.hypothesis import Hypothesis
+from simopt_envs.gap.known import completed, to_take
 from simopt_envs.gap.looks import along_uncertain, of_other_sizes
 from simopt_envs.measured.replay import start_curvature, start_sensitivity
 from simopt_envs.measured.windows import Windows
@@ -210,7 +211,7 @@ class Misfit:
         return Noise.of(scale, np.where(self._counted, np.nan_to_num(starts), 0.0))
 
     def bent_by_starts(self, u: Array, scale: Array) -> Array:
-        """What uncertain starts make of windows beyond the linear, and so not in the noise, at u (d,), (w,).
+        """What uncertain starts make of windows beyond the linear, and so not in the noise, at u (d,), (w, c).
 
         Mean squares in a noise (c,), infinite where a simulation ran away. Over two standard errors as well as over
         one: something, as a finger that catches, may happen beyond the first.
@@ -218,7 +219,7 @@ class Misfit:
         model, xi = self.hypothesis.model, self.hypothesis.xi(u[None])
         changes = [start_curvature(model, self._simulate, xi, errors=errors) for errors in (1.0, 2.0)]
         made = np.where(self._counted, np.sum((np.array(changes) / scale) ** 2, axis=1), 0.0)
-        return np.nan_to_num(np.max(np.mean(made, axis=(2, 3)), axis=0), nan=np.inf)
+        return np.nan_to_num(np.max(np.mean(made, axis=2), axis=0), nan=np.inf)
 
     def noise_floor(self, u: Array) -> Array:
         """Standard deviation of the part of the errors at u (d,) that one sample does not share with the next, (c,).
@@ -265,12 +266,12 @@ def fit(
         start: u to begin from, (d,).
         iterations: of Gauss-Newton with Levenberg's damping, at most.
         known: the Jacobian by the first k of u, (m, k), where it is known well enough from a fit nearby: it saves the
-            most of the work. None to take all by differences. Of all of u, where a fit leads is told and no more: the
-            Jacobian returned is that.
+            most of the work; NaN by what is to be taken, see :func:`of_silent`. None to take all by differences. Of all
+            of u, where a fit leads is told and no more: the Jacobian returned is that.
         differences: over which derivatives are taken, one after another; from a start that is a fit, fine ones do.
     """
     hypothesis = misfit.hypothesis
-    fresh = list(range(0 if known is None else known.shape[1], len(start)))
+    fresh = to_take(known, len(start))
     chart = Chart(hypothesis, fresh)
     of_effects = [i for i in fresh if i >= hypothesis.num_plain]
 
@@ -279,13 +280,11 @@ def fit(
         return np.hstack([misfit.errors(u).reshape(len(u), -1), columns.T * chart.pull]).T
 
     def jacobian(x: Array, difference: float) -> Array:
-        rows = [] if known is None else [known]
-        if fresh:
-            rows.append(misfit.jacobian(chart.bent(x), fresh, difference, chart))
-        return np.vstack([np.hstack(rows), np.diag(chart.pull)])
+        data = completed(known, len(x), lambda columns: misfit.jacobian(chart.bent(x), columns, difference, chart))
+        return np.vstack([data, np.diag(chart.pull)])
 
     x = chart.straight(np.clip(start, hypothesis.low, hypothesis.high))
-    few = 0 < len(fresh) < len(start)
+    few = 0 < len(fresh) == len(of_effects) < len(start)
     for difference in differences:
         least = _LEAST_GAIN if difference == differences[-1] else _LEAST_COARSE_GAIN
         derivatives = _Derivatives(partial(jacobian, difference=difference), few)

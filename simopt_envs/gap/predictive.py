@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
 from simopt_envs.gap.fit import Fit, Misfit
+from simopt_envs.gap.known import completed
 from simopt_envs.physics.parameters import Array
 
 
@@ -39,13 +40,15 @@ class HeldOut:
             misfit: on the windows, in ``tolerance`` times the sensors' noise.
             u: coordinates, (d,).
             tolerance: (c,).
-            known: the Jacobian by the first k of u, (w, S, c, k), where it is known well enough; None to take all.
+            known: the Jacobian by the first k of u, (w, S, c, k), where it is known well enough; NaN by what is to be
+                taken, see :func:`~simopt_envs.gap.known.of_silent`. None to take all.
         """
         errors = tolerance * misfit.errors(u[None])[0]
-        first = 0 if known is None else known.shape[-1]
-        taken = tolerance[:, None] * misfit.jacobian(u, range(first, len(u))).reshape(*errors.shape, -1)
-        jacobian = taken if known is None else np.concatenate([known, taken], axis=-1)
-        return cls(errors, jacobian, misfit.noise.log_det)
+
+        def taken(columns: list[int]) -> Array:
+            return tolerance[:, None] * misfit.jacobian(u, columns).reshape(*errors.shape, -1)
+
+        return cls(errors, completed(known, len(u), taken), misfit.noise.log_det)
 
     def select(self, rows: NDArray[np.intp]) -> HeldOut:
         """Those of some windows, laid out alike whatever they come from: sums depend on that in their last digits."""

@@ -12,6 +12,7 @@ import numpy as np
 from simopt_envs.gap.thresholds import LEAST_LEFT, LONG_WINDOW, WINDOW
 from simopt_envs.gap.trial import Data
 from simopt_envs.measured.audit import audited
+from simopt_envs.measured.channels import model_channels
 from simopt_envs.measured.recording import Finding, Recording, warnings_of
 from simopt_envs.measured.windows import Windows, cut_windows
 from simopt_envs.physics.effects.actuator_delay import LONGEST
@@ -78,7 +79,8 @@ def longer_windows(model: mujoco.MjModel, data: Data, keyframe: str | None = Non
     """The same recordings in longer windows, the longest first: whole ones, their halves, and thirds.
 
     Of a recording longer than ``LONG_WINDOW``, equal parts of it count as whole. Left out is what is not twice as long
-    as recordings are cut already, and of which gaps leave too little.
+    as recordings are cut already, and of which gaps leave too little. There are none where columns were left out:
+    what moves unseen makes more of the others, too, the longer it does.
     """
     period = float(data.fitted.offsets[1])
     shortest = min(r.duration for r in (*data.fitted_recordings, *data.held_out_recordings))
@@ -92,6 +94,9 @@ def longer_windows(model: mujoco.MjModel, data: Data, keyframe: str | None = Non
             return None
         return cut if len(cut) * seconds >= LEAST_LEFT * len(windows) * data.seconds else None
 
+    known = model_channels(model)
+    if len(data.fitted.channels) < sum(name in known for name in data.fitted_recordings[0].signals):
+        return ()
     found = []
     for seconds in (samples // parts * period for parts in (1, 2, 3)):
         if seconds >= 2 * data.seconds:

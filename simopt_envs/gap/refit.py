@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from simopt_envs.adaptation.checkpoint import Result
 from simopt_envs.gap.fit import DIFFERENCES, Fit, Misfit, fit
 from simopt_envs.gap.hypothesis import Candidate
+from simopt_envs.gap.known import of_silent
 from simopt_envs.gap.large import SECONDS, best_of_each, of_some_size
 from simopt_envs.gap.plain import SPEAKS_FOR
 from simopt_envs.gap.predictive import HeldOut
@@ -61,7 +62,8 @@ def fitted(refit: Refit, base: Base, windows: Windows, held_out: Windows, num_th
     if refit.near is None:
         found, foreseen = _first(refit, base, misfit, on, windows.seconds), base.held_out.jacobian
     else:
-        found, foreseen = _further(refit, base, refit.near, misfit, on), None
+        found = _further(refit, base, refit.near, misfit, on)
+        foreseen = of_silent(base.held_out.jacobian, hypothesis.num_plain)
         test = test.with_own_noise(found.u)
     told = HeldOut.of(test, found.u, base.tolerance, foreseen)
     return {**vars(found), **{f"held_out_{name}": array for name, array in vars(told).items()}}
@@ -101,7 +103,7 @@ def _first(refit: Refit, base: Base, misfit: Misfit, on: Callable[[NDArray[np.in
 
 
 def _further(refit: Refit, base: Base, near: Array, misfit: Misfit, on: Callable[[NDArray[np.intp]], Misfit]) -> Fit:
-    """On from another fit, with all derivatives taken at each step.
+    """On from another fit, with all derivatives taken that show anything in the data.
 
     Errors are counted in the noise of its own where they are likelier in that: what uncertain starts leave depends on
     the model, as friction brings them to rest.
@@ -112,7 +114,8 @@ def _further(refit: Refit, base: Base, near: Array, misfit: Misfit, on: Callable
         of_base = range(len(base.fit.u))
         others = [_coarsely(half, u, half.jacobian(u, of_base, DIFFERENCES[0])) for u in refit.others]
     start = misfit.best(np.array([near, *others]))
-    return fit(misfit.with_own_noise(start), start, ITERATIONS, differences=DIFFERENCES[1:])
+    known = of_silent(base.fit.jacobian, misfit.hypothesis.num_plain)
+    return fit(misfit.with_own_noise(start), start, ITERATIONS, known, DIFFERENCES[1:])
 
 
 def _coarsely(misfit: Misfit, start: Array, known: Array) -> Array:

@@ -71,7 +71,8 @@ def _shorter(hypothesis: Hypothesis, data: Data, seconds: float, keyframe: str |
     if seconds >= data.seconds or seconds <= 2 * model.nv * float(data.fitted.offsets[1]):
         return None
     windows = cut_windows(model, recordings, seconds, keyframe=keyframe, history=2 * LONGEST, centred=True)
-    return windows.select(np.flatnonzero(~overlap(windows, (*data.wild, *data.outliers))))
+    kept = np.flatnonzero(~overlap(windows, (*data.wild, *data.outliers)))
+    return windows.of_columns(data.fitted.names).select(kept)
 
 
 def _fitted(base: Base, windows: Windows, fit: FitAll) -> Array:

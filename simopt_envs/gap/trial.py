@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -60,6 +61,11 @@ class Data:
             for windows, rows in self._of_each(fitted, held_out)
         ]
         return replace(self, fitted=few[0], held_out=few[1], warnings=(*self.warnings, warning))
+
+    def of_columns(self, names: Sequence[str], warnings: Sequence[Finding]) -> Self:
+        """Compared in some columns alone, and warnings that the others are left out."""
+        few = [windows.of_columns(names) for windows in (self.fitted, self.held_out)]
+        return replace(self, fitted=few[0], held_out=few[1], warnings=(*self.warnings, *warnings))
 
     def stretches(self, fitted: NDArray[np.bool_], held_out: NDArray[np.bool_]) -> tuple[Stretch, ...]:
         """Where the windows are that are told, (w,) of each."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import mujoco
 import numpy as np
@@ -18,6 +19,8 @@ from simopt_envs.physics.parameters import unknown_name
 _POSITION_PRIOR = 1.0  # sd of an unmeasured joint around the reference [rad, m]: decides only what nothing sees
 _VELOCITY_PRIOR = 10.0  # the same of its velocity around rest [rad/s, m/s]
 _SCALAR = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE))
+_LEARNT_FROM = 8  # samples of a recording
+_TOLD = 5.0  # directions in all of these that sites and sensors must tell for that to tell of others
 _LEAST_ERROR = 1e-6  # no measurement counts as more exact than this
 
 
@@ -82,6 +85,32 @@ def estimate_states(
     smoothed = {c.name: smooth(recording[c.name], recording.period) for c in seen if c.name not in paired}
     for name, rate in paired.items():
         smoothed[name] = smooth_with_rate(recording[name], recording[rate.name], recording.period)
+    states, unseen = _by_columns(model, seen, smoothed, samples, keyframe)
+    if np.isnan(states.qpos).any():
+        raise ValueError(f"{recording.name}: a joint position is missing at a sample whose state is wanted")
+    if unseen.any():
+        joints = _Unseen(model, np.flatnonzero(unseen), seen, smoothed)
+        if joints.are_many:
+            spread = np.linspace(0, len(recording) - 1, _LEARNT_FROM).round().astype(np.intp)
+            joints.learn(_by_columns(model, seen, smoothed, spread, keyframe)[0], spread)
+        joints.fit(states, samples)
+    for channel in (c for c in seen if c.kind == "qvel" and c not in paired.values()):
+        signal = smoothed[channel.name]
+        measured = signal.value[samples]
+        good = np.isfinite(measured)
+        states.qvel[good, channel.index] = measured[good]
+        states.qvel_error[good, channel.index] = signal.value_error[samples][good]
+    return states
+
+
+def _by_columns(
+    model: mujoco.MjModel,
+    seen: list[Channel],
+    smoothed: dict[str, Smoothed],
+    samples: NDArray[np.intp],
+    keyframe: str | None,
+) -> tuple[States, NDArray[np.bool_]]:
+    """What columns of positions tell, all else at the reference, and which degrees of freedom that is, (nv,)."""
     qpos = np.tile(reference_qpos(model, keyframe), (len(samples), 1))
     rates = np.zeros_like(qpos)
     qpos_error = np.full((len(samples), model.nv), _POSITION_PRIOR)
@@ -98,19 +127,8 @@ def estimate_states(
         if model.jnt_type[channel.object] in _SCALAR:
             qacc[:, dofs] = signal.acceleration[samples, None]
         unseen[dofs] = False
-    if np.isnan(qpos).any():
-        raise ValueError(f"{recording.name}: a joint position is missing at a sample whose state is wanted")
     qvel = np.array([_tangent(model, q, rate) for q, rate in zip(qpos, rates, strict=True)]).reshape(-1, model.nv)
-    states = States(qpos, qvel, qpos_error, qvel_error, qacc)
-    if unseen.any():
-        _fit_unseen(model, states, np.flatnonzero(unseen), seen, smoothed, samples)
-    for channel in (c for c in seen if c.kind == "qvel" and c not in paired.values()):
-        signal = smoothed[channel.name]
-        measured = signal.value[samples]
-        good = np.isfinite(measured)
-        qvel[good, channel.index] = measured[good]
-        qvel_error[good, channel.index] = signal.value_error[samples][good]
-    return states
+    return States(qpos, qvel, qpos_error, qvel_error, qacc), unseen
 
 
 def _dofs_of(model: mujoco.MjModel, channel: Channel) -> slice:
@@ -135,63 +153,120 @@ def _tangent(model: mujoco.MjModel, qpos: Array, rate: Array) -> Array:
     return qvel
 
 
-def _fit_unseen(
-    model: mujoco.MjModel,
-    states: States,
-    dofs: NDArray[np.intp],
-    seen: list[Channel],
-    smoothed: dict[str, Smoothed],
-    samples: NDArray[np.intp],
-) -> None:
-    """Fit the degrees of freedom without a column, in place: positions by least squares, then velocities linearly."""
-    data = mujoco.MjData(model)
-    position = [c for c in seen if depends_on_stage(model, c, mujoco.mjtStage.mjSTAGE_POS)]
-    velocity = [c for c in seen if depends_on_stage(model, c, mujoco.mjtStage.mjSTAGE_VEL)]
+class _Unseen:
+    """Degrees of freedom without a column, which are fitted: positions by least squares, then velocities linearly.
 
-    def measured(channels: list[Channel], attribute: str, sample: int) -> Array:
-        return np.array([getattr(smoothed[c.name], attribute)[sample] for c in channels])
+    Args:
+        model: theirs.
+        dofs: which they are.
+        seen: what was measured.
+        smoothed: the same by name.
+    """
 
-    offset = np.zeros(len(dofs))
-    for w, sample in enumerate(samples):
-        reference, known_velocity = states.qpos[w].copy(), states.qvel[w].copy()
-        targets = measured(position, "value", sample)
-        position_error = np.maximum(measured(position, "value_error", sample), _LEAST_ERROR)
-        rate_error = np.append(
-            measured(position, "velocity_error", sample), measured(velocity, "value_error", sample)
+    def __init__(
+        self, model: mujoco.MjModel, dofs: NDArray[np.intp], seen: list[Channel], smoothed: dict[str, Smoothed]
+    ):
+        self._model, self._data, self._dofs, self._smoothed = model, mujoco.MjData(model), dofs, smoothed
+        self._position = [c for c in seen if depends_on_stage(model, c, mujoco.mjtStage.mjSTAGE_POS)]
+        self._velocity = [c for c in seen if depends_on_stage(model, c, mujoco.mjtStage.mjSTAGE_VEL)]
+        self._prior = np.array([_POSITION_PRIOR, _VELOCITY_PRIOR])[:, None] * np.ones(len(dofs))
+
+    @property
+    def are_many(self) -> bool:
+        """Whether they are more than the sites' and sensors' columns, which then cannot tell all of them."""
+        return len(self._dofs) > len(self._position) + len(self._velocity)
+
+    def learn(self, states: States, samples: NDArray[np.intp]) -> None:
+        """Narrow the priors to how far from the reference, and how fast, what is seen of these says that they are.
+
+        Those directions of many joints that nothing tells are then about as far off as those that something does. Each
+        window would start with all parts of a rope anywhere, at any speed, otherwise.
+
+        Args:
+            states: the rest of the state.
+            samples: where.
+        """
+        squares, told = np.zeros((2, 2, len(self._dofs)))
+        offset, known = np.zeros(len(self._dofs)), np.flatnonzero(np.isfinite(states.qpos).all(axis=1))
+        for w in known:
+            qpos, qvel = states.qpos[w], states.qvel[w]
+            offset, offset_covariance = self._offset(qpos, samples[w], offset)
+            rate, rate_covariance = self._rate(self._moved(qpos, offset), qvel, samples[w])
+            squares += np.square([offset, rate])
+            told += 1 - np.array([np.diag(offset_covariance), np.diag(rate_covariance)]) / self._prior**2
+        turns = self._turns()
+        for kind in (turns, ~turns):
+            number = np.sum(told[:, kind], axis=1)
+            size = np.sqrt(np.sum(squares[:, kind], axis=1) / np.maximum(number, _TOLD))
+            size = np.where(number < _TOLD, np.inf, np.maximum(size, _LEAST_ERROR))
+            self._prior[:, kind] = np.minimum(self._prior[:, kind], size[:, None])
+
+    def fit(self, states: States, samples: NDArray[np.intp]) -> None:
+        """Fit them at some samples, in place."""
+        offset = np.zeros(len(self._dofs))
+        for w, sample in enumerate(samples):
+            offset, covariance = self._offset(states.qpos[w], sample, offset)  # the next window starts from here
+            states.qpos[w] = self._moved(states.qpos[w], offset)
+            states.qpos_error[w, self._dofs] = np.sqrt(np.diag(covariance))
+            rate, covariance = self._rate(states.qpos[w], states.qvel[w], sample)
+            states.qvel[w, self._dofs] = rate
+            states.qvel_error[w, self._dofs] = np.sqrt(np.diag(covariance))
+
+    def _turns(self) -> NDArray[np.bool_]:
+        """Which of them are angles."""
+        slides = int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_FREE)
+        joints = self._model.dof_jntid[self._dofs]
+        offset = self._dofs - self._model.jnt_dofadr[joints]
+        return ~(np.isin(self._model.jnt_type[joints], slides) & (offset < 3))
+
+    def _measured(self, channels: list[Channel], attribute: str, sample: int) -> Array:
+        return np.array([getattr(self._smoothed[c.name], attribute)[sample] for c in channels])
+
+    def _moved(self, reference: Array, offset: Array) -> Array:
+        qpos, tangent = reference.copy(), np.zeros(self._model.nv)
+        tangent[self._dofs] = offset
+        mujoco.mj_integratePos(self._model, qpos, tangent, 1.0)
+        return qpos
+
+    def _offset(self, reference: Array, sample: int, start: Array) -> tuple[Array, Array]:
+        """How far they are from a reference (nq,), and the covariance of that."""
+        targets = self._measured(self._position, "value", sample)
+        error = np.maximum(self._measured(self._position, "value_error", sample), _LEAST_ERROR)
+
+        def misfit(offset: Array) -> Array:
+            at_rest = np.zeros(self._model.nv)
+            values = read_state(self._model, self._data, self._moved(reference, offset), at_rest, self._position)
+            return np.append(np.nan_to_num((values - targets) / error), offset / self._prior[0])
+
+        fit = least_squares(misfit, start)
+        return fit.x, np.linalg.inv(fit.jac.T @ fit.jac)
+
+    def _rate(self, qpos: Array, known_velocity: Array, sample: int) -> tuple[Array, Array]:
+        """Their velocities in a posture, and the covariance of these."""
+        error = np.append(
+            self._measured(self._position, "velocity_error", sample),
+            self._measured(self._velocity, "value_error", sample),
         ).clip(_LEAST_ERROR)
+        base = np.where(np.isin(np.arange(self._model.nv), self._dofs), 0.0, known_velocity)
+        rates = np.append(
+            self._measured(self._position, "velocity", sample), self._measured(self._velocity, "value", sample)
+        )
+        read = partial(read_state, self._model, self._data)
 
-        def posture(offset: Array, reference: Array = reference) -> Array:
-            qpos, tangent = reference.copy(), np.zeros(model.nv)
-            tangent[dofs] = offset
-            mujoco.mj_integratePos(model, qpos, tangent, 1.0)
-            return qpos
-
-        def misfit(offset: Array, targets: Array = targets, error: Array = position_error) -> Array:
-            values = read_state(model, data, posture(offset), np.zeros(model.nv), position)
-            return np.append(np.nan_to_num((values - targets) / error), offset / _POSITION_PRIOR)
-
-        fit = least_squares(misfit, offset)
-        offset = fit.x  # the next window starts from here
-        states.qpos[w] = qpos = posture(offset)
-        states.qpos_error[w, dofs] = np.sqrt(np.diag(np.linalg.inv(fit.jac.T @ fit.jac)))
-
-        base = np.where(np.isin(np.arange(model.nv), dofs), 0.0, known_velocity)
-        rates = np.append(measured(position, "velocity", sample), measured(velocity, "value", sample))
-
-        def predicted_rates(qvel: Array, qpos: Array = qpos) -> Array:
+        def predicted_rates(qvel: Array) -> Array:
             step, later = 1e-5, qpos.copy()
-            mujoco.mj_integratePos(model, later, qvel, step)
-            moved = read_state(model, data, later, qvel, position) - read_state(model, data, qpos, qvel, position)
-            return np.append(moved / step, read_state(model, data, qpos, qvel, velocity))
+            mujoco.mj_integratePos(self._model, later, qvel, step)
+            moved = read(later, qvel, self._position) - read(qpos, qvel, self._position)
+            return np.append(moved / step, read(qpos, qvel, self._velocity))
 
         at_base = predicted_rates(base)
-        unit = np.eye(model.nv)[dofs]
-        slope = np.array([predicted_rates(base + direction) - at_base for direction in unit]).T.reshape(-1, len(dofs))
+        unit = np.eye(self._model.nv)[self._dofs]
+        slope = np.array([predicted_rates(base + direction) - at_base for direction in unit]).T.reshape(-1, len(unit))
         finite = np.isfinite(rates)
-        rows = slope[finite] / rate_error[finite, None]
-        precision = rows.T @ rows + np.eye(len(dofs)) / _VELOCITY_PRIOR**2
-        states.qvel[w, dofs] = np.linalg.solve(precision, rows.T @ ((rates - at_base)[finite] / rate_error[finite]))
-        states.qvel_error[w, dofs] = np.sqrt(np.diag(np.linalg.inv(precision)))
+        rows = slope[finite] / error[finite, None]
+        precision = rows.T @ rows + np.diag(self._prior[1] ** -2.0)
+        pull = rows.T @ ((rates - at_base)[finite] / error[finite])
+        return np.linalg.solve(precision, pull), np.linalg.inv(precision)
 
 
 def depends_on_stage(model: mujoco.MjModel, channel: Channel, stage: mujoco.mjtStage) -> bool:

@@ -67,6 +67,11 @@ class Windows:
         recording = tuple(self.recording[row] for row in rows)
         return replace(self, recording=recording, starts=self.starts.select(rows), **taken)
 
+    def of_columns(self, names: Sequence[str]) -> Windows:
+        """The same, compared in some of their columns alone."""
+        shown = [c for c, channel in enumerate(self.channels) if channel.name in names]
+        return replace(self, channels=tuple(self.channels[c] for c in shown), measured=self.measured[..., shown])
+
     def find(self, others: Windows) -> NDArray[np.intp]:
         """Where some of them are among all, (k,)."""
         wanted = set(zip(others.recording, others.start_time.tolist(), strict=True))
