@@ -115,7 +115,7 @@ def _further(refit: Refit, base: Base, near: Array, misfit: Misfit, on: Callable
         others = [_coarsely(half, u, half.jacobian(u, of_base, DIFFERENCES[0])) for u in refit.others]
     start = misfit.best(np.array([near, *others]))
     known = of_silent(base.fit.jacobian, misfit.hypothesis.num_plain)
-    return fit(misfit.with_own_noise(start), start, ITERATIONS, known, DIFFERENCES[1:])
+    return fit(misfit.with_own_noise(start), start, ITERATIONS, known=known, differences=DIFFERENCES[1:])
 
 
 def _coarsely(misfit: Misfit, start: Array, known: Array) -> Array:
