@@ -16,7 +16,7 @@ from simopt_envs.gap.large import SECONDS, best_of_each, of_some_size
 from simopt_envs.gap.plain import SPEAKS_FOR
 from simopt_envs.gap.predictive import HeldOut
 from simopt_envs.gap.screen import Screened
-from simopt_envs.gap.thresholds import FAR
+from simopt_envs.gap.thresholds import FAR, LARGE
 from simopt_envs.gap.trial import Base, Trial
 from simopt_envs.measured.windows import Windows
 from simopt_envs.physics.parameters import Array
@@ -59,11 +59,12 @@ def fitted(refit: Refit, base: Base, windows: Windows, held_out: Windows, num_th
 
     misfit, test = (Misfit(hypothesis, some, num_threads) for some in (windows, held_out))
     misfit, test = misfit.with_noise(base.noise), test.with_noise(base.held_out_noise)
+    foreseen: Array | None
     if refit.near is None:
         found, foreseen = _first(refit, base, misfit, on, windows.seconds), base.held_out.jacobian
     else:
         found = _further(refit, base, refit.near, misfit, on)
-        foreseen = of_silent(base.held_out.jacobian, hypothesis.num_plain)
+        foreseen = _silent(base, base.held_out.jacobian)
         test = test.with_own_noise(found.u)
     told = HeldOut.of(test, found.u, base.tolerance, foreseen)
     return {**vars(found), **{f"held_out_{name}": array for name, array in vars(told).items()}}
@@ -114,8 +115,14 @@ def _further(refit: Refit, base: Base, near: Array, misfit: Misfit, on: Callable
         of_base = range(len(base.fit.u))
         others = [_coarsely(half, u, half.jacobian(u, of_base, DIFFERENCES[0])) for u in refit.others]
     start = misfit.best(np.array([near, *others]))
-    known = of_silent(base.fit.jacobian, misfit.hypothesis.num_plain)
+    known = _silent(base, base.fit.jacobian)
     return fit(misfit.with_own_noise(start), start, ITERATIONS, known=known, differences=DIFFERENCES[1:])
+
+
+def _silent(base: Base, jacobian: Array) -> Array | None:
+    """What of a base's Jacobian (..., d) need not be taken; where an effect has bent that, it tells of elsewhere."""
+    bent = base.excess >= LARGE or base.strained
+    return None if bent else of_silent(jacobian, base.hypothesis.num_plain)
 
 
 def _coarsely(misfit: Misfit, start: Array, known: Array) -> Array:

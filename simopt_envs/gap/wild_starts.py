@@ -46,12 +46,15 @@ def without_wild_starts(hypothesis: Hypothesis, u: Array, data: Data, scale: Arr
 def without_wild_columns(hypothesis: Hypothesis, u: Array, data: Data, scale: Array) -> Data:
     """Without the sites and sensors in which the start decides in most windows, where it is most windows it decides.
 
-    What hangs on many joints that no column shows may start in any way, of which a site tells little: by itself it says
-    next to nothing of the model, and what is not linear in it bends all fits to the others.
+    What hangs on more joints than they have columns may start in any way, of which a site tells little: by itself it
+    says next to nothing of the model, and what is not linear in it bends all fits to the others.
     """
-    both = data.fitted, data.held_out
+    both, channels, dofs = (data.fitted, data.held_out), data.fitted.channels, hypothesis.model.dof_jntid
+    others = [c.kind not in ("qpos", "qvel") for c in channels]
+    if np.sum(~np.isin(dofs, [c.object for c in channels if c.kind == "qpos"])) <= sum(others):
+        return data
     bent = np.concatenate([Misfit(hypothesis, windows).bent_by_starts(u, scale) for windows in both])
-    wild = (np.median(bent, axis=0) > WILD) & [c.kind not in ("qpos", "qvel") for c in data.fitted.channels]
+    wild = (np.median(bent, axis=0) > WILD) & others
     if np.mean(np.mean(bent, axis=1) > WILD) <= 0.5 or not wild.any() or wild.all():
         return data
     names = np.array(data.fitted.names)
