@@ -13,7 +13,7 @@ import pytest
 from conftest import needs_effects
 from gap_plant import MODEL, record
 
-from simopt_envs.gap import find, find_gap
+from simopt_envs.gap import find, find_gap, wild_starts
 from simopt_envs.gap.fit import Misfit, by_part
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
 from simopt_envs.gap.motion import motion_of
@@ -258,6 +258,12 @@ def test_sites_whose_start_decides_in_most_windows_are_left_out(links, left):
     assert bool(problem.longer) == (left == 4), "what hangs loose is no better known in longer windows"
     told = [warning.channel for warning in problem.data.warnings if "left out" in str(warning)]
     assert told == ([] if left == 4 else ["site/tip/x", "site/tip/z"])
+
+
+@needs_effects
+def test_a_site_that_tells_all_joints_stays_though_most_windows_are_such(monkeypatch):
+    monkeypatch.setattr(wild_starts, "WILD", 0.0)
+    assert len(find.read(*of_a_rope(1)).data.fitted.names) == 4
 
 
 @needs_effects
