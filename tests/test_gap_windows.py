@@ -19,7 +19,7 @@ from simopt_envs.gap.hypothesis import Candidate, Hypothesis
 from simopt_envs.gap.motion import motion_of
 from simopt_envs.gap.outliers import without_outliers
 from simopt_envs.gap.plain import Plain, plain_parameters
-from simopt_envs.gap.recordings import longer_windows, read_windows
+from simopt_envs.gap.recordings import longer_windows, read_windows, whole_from_rest
 from simopt_envs.gap.search import Search
 from simopt_envs.gap.thresholds import LARGE, WILD
 from simopt_envs.gap.trial import Base, Data
@@ -383,3 +383,76 @@ def test_windows_keep_off_both_ends_of_a_recording():
 def test_starts_are_told_apart_by_the_windows_that_a_base_leaves_most_of(count, rows):
     base: Any = SimpleNamespace(fit=SimpleNamespace(errors=np.array([1.0, 0.5, -4.0, 2.0]).reshape(4, 1, 1)))
     np.testing.assert_array_equal(Base.worst(base, count), rows)
+
+
+def of_a_hanging_rope(damping: float, at_rest: bool) -> tuple[mujoco.MjSpec, list[Recording]]:
+    """A rope of four links that hangs from a cart, which its drive begins to shake as the recording begins."""
+    rope = "<site name='tip' pos='0 0 -0.2'/>" + "</body>" * 4
+    for i in reversed(range(4)):
+        rope = (
+            f"<body pos='0 0 {-0.2 if i else 0}'><joint name='link{i}' axis='0 1 0' damping='5e-3'/>"
+            f"<geom type='capsule' fromto='0 0 0 0 0 -0.2' size='0.01' mass='0.02'/>{rope}"
+        )
+    spec = mujoco.MjSpec.from_string(
+        "<mujoco><option timestep='0.002'/><worldbody><body><joint name='cart' type='slide' axis='1 0 0' damping='5'/>"
+        f"<geom type='box' size='0.1 0.1 0.1' mass='5'/>{rope}</body></worldbody><actuator>"
+        "<position name='cart' joint='cart' kp='500' kv='50' delay='0.01' nsample='8'/></actuator></mujoco>"
+    )
+    spec.option.disableflags = mujoco.mjtDisableBit.mjDSBL_CONTACT
+    model, rng, recordings, time = spec.compile(), np.random.default_rng(0), [], 0.02 * np.arange(101)
+    model.joint("link1").damping[:] = damping
+    for i in range(4):
+        data, command, rows = mujoco.MjData(model), 0.1 * np.cos((i + 3) * time), []
+        for value in command:
+            mujoco.mj_kinematics(model, data)
+            rows.append([data.qpos[0], *data.site_xpos[0]] + np.array([2e-4, *[1e-3] * 3]) * rng.standard_normal(4))
+            data.ctrl[:] = value
+            mujoco.mj_step(model, data, 10)
+        names = ("qpos/cart", "site/tip/x", "site/tip/y", "site/tip/z")
+        columns = {"ctrl/cart": command, **dict(zip(names, np.array(rows).T, strict=True))}
+        recordings.append(Recording(time, columns, f"run_{i}", at_rest=at_rest))
+    return spec, recordings
+
+
+@needs_effects
+@pytest.mark.parametrize(
+    ("damping", "at_rest", "named"), [(2e-2, True, True), (2e-2, False, False), (5e-3, True, False)]
+)
+def test_what_acts_in_a_rope_is_named_where_it_is_told_that_it_hangs_at_rest(damping, at_rest, named):
+    spec, recordings = of_a_hanging_rope(damping, at_rest)
+    gap = find_gap(spec, recordings, effects=[EFFECTS["viscous_friction"], EFFECTS["joint_spring"]])
+    assert gap.data.seconds == pytest.approx(2.0 if at_rest else 0.5)
+    assert len(gap.data.fitted.names) == (4 if at_rest else 2)
+    assert [str(effect.candidate) for effect in gap.effects] == ["viscous_friction at joint:link1"] * named
+    assert gap.verdict == ("named" if named else "none")
+
+
+def test_recordings_from_rest_are_taken_alone_where_they_are_half_of_all_and_short():
+    model = mujoco.MjModel.from_xml_string(LOOSE.format(gravity=-9.81))
+    recordings = swing(model, hanging(6), np.random.default_rng(0))
+
+    def whole(resting: int, of: Sequence[Recording] = recordings) -> Data | None:
+        return whole_from_rest(model, [replace(r, at_rest=i < resting) for i, r in enumerate(of)])
+
+    data = whole(4)
+    assert data is not None
+    assert {*data.fitted.recording, *data.held_out.recording} == {f"run_{i}" for i in range(4)}
+    assert data.seconds == pytest.approx(2.0)
+    np.testing.assert_array_equal(data.fitted.start_time, 0.0)
+    assert whole(3) is not None
+    assert whole(2) is None
+    assert whole(0) is None
+    assert whole(1, recordings[:1]) is None, "none would be left to hold out"
+    long = [replace(recording, time=4.1 * recording.time) for recording in recordings]
+    assert whole(6, long) is None, "most of them is far from where they rested"
+
+
+@needs_effects
+@pytest.mark.parametrize(("push", "seconds"), [(0.0, 2.0), (1.0, 0.5)])
+def test_recordings_from_rest_are_cut_where_a_model_is_far_from_them(push, seconds):
+    """The rod from where it hangs; a push that nothing tells leaves hundreds of times the noise."""
+    spec = mujoco.MjSpec.from_string(LOOSE.format(gravity=-9.81).replace('name="hinge" axis', 'name="hinge" axis'))
+    recordings = [replace(r, at_rest=True) for r in swing(spec.compile(), [np.pi] * 4, np.random.default_rng(0), push)]
+    assert find.read(spec, recordings).data.seconds == pytest.approx(2.0)
+    gap = find_gap(spec, recordings, effects=[EFFECTS["sensor_bias"]])
+    assert gap.data.seconds == pytest.approx(seconds)

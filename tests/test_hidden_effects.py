@@ -15,6 +15,7 @@ from benchmarks.hidden_effects.detectability import Observability, reduced
 from benchmarks.hidden_effects.generate import column_names, simulate, write_case
 from benchmarks.hidden_effects.outside import OUTSIDE
 from benchmarks.hidden_effects.plants import RECORDINGS, nominal_model, plants
+from benchmarks.hidden_effects.run import recordings
 from benchmarks.hidden_effects.score import Answer, Rate, confusion, magnitude_errors, plant_table, rates
 from benchmarks.hidden_effects.truth import HALF_STEP_LEAD, TIMESTEP, World, delayed
 
@@ -55,6 +56,16 @@ def test_the_case_folder_holds_model_and_recordings_and_no_word_of_the_label(tmp
     assert label["effects"][0]["where"] == "joint:elbow"
     assert label["effects"][0]["parameters"] == {"frictionloss": 0.05}
     assert column_names("two_link") == (folder / "rec_0.csv").read_text().splitlines()[0].split(",")
+
+
+def test_cases_of_tasks_say_which_of_their_recordings_begin_at_rest(tmp_path):
+    folder = write_case(Case(5, "drawer", "null", ()), tmp_path / "cases", tmp_path / "labels")
+    read = recordings(folder)
+    assert [recording.at_rest for recording in read] == [True, True, False, True, True, False, True, True]
+    drawer = nominal_model("drawer")
+    for recording in read:
+        start = [recording[f"qpos/joint{i}"][0] for i in range(1, 8)]
+        assert recording.at_rest == (np.abs(start - drawer.key_qpos[0][:7]).max() < 0.1)
 
 
 def replay_error(law):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -132,6 +133,15 @@ def test_select_split_and_windows():
     assert all(len(w) == 101 for w in windows)
     holed = Recording(np.delete(recording.time, np.s_[450:470]), {"qpos/a": np.zeros(980)})
     assert [round(w.time[0], 2) for w in holed.windows(1.0)] == [0, 1, 2, 3, 5, 6, 7, 8]
+
+
+def test_what_begins_at_rest_does_so_until_its_beginning_is_cut_off():
+    recording = replace(sine(rate=100, seconds=10), at_rest=True)
+    early, late = recording.split(0.6)
+    assert (early.at_rest, late.at_rest) == (True, False)
+    assert recording.resample(0.02).at_rest
+    assert [window.at_rest for window in recording.windows(4.0)] == [True, False]
+    assert not sine(rate=100, seconds=10).at_rest, "unless it is told"
 
 
 # --- mappings -------------------------------------------------------------------------------------------------------

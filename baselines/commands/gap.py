@@ -25,7 +25,7 @@ from baselines.commands.progress import SECONDS_BETWEEN_LINES
 from baselines.commands.recordings import existing_logs
 from simopt_envs.distributions import Gaussian
 from simopt_envs.engine import Engine, ThreadEngine
-from simopt_envs.measured import load_recording
+from simopt_envs.measured import load_recording, load_recordings
 from simopt_envs.physics import Parameter, ParameterSpace
 from simopt_envs.physics.spec_writer import write_spec
 
@@ -55,6 +55,9 @@ class Gap:
     of an environment the first p(ξ) of adapt."""
     keyframe: str | None = None
     """Where joints start that no column tells of; by default the model's reference, of an environment its home."""
+    at_rest: tuple[Path, ...] = ()
+    """Those of the recordings that begin with everything at rest, joints that no column tells of at that keyframe: a
+    rope hangs, a drawer is shut. If they are most, they alone are compared, from there to their ends."""
 
     where: Annotated[EngineOptions, tyro.conf.arg(name="")] = field(default_factory=EngineOptions)
     """What fits the candidates."""
@@ -65,6 +68,13 @@ class Gap:
 
         logs = existing_logs(self.data)
         existing(path for path in (self.mapping, self.config) if path is not None)
+        if others := set(self.at_rest) - set(self.data):
+            raise ValueError(f"--at-rest names {min(others)}, which is none of the recordings of --data")
+        recordings = [
+            replace(recording, at_rest=log in self.at_rest)
+            for log in logs
+            for recording in load_recordings(log, self.mapping)
+        ]
         require_free(self.out, resume=False)
         model: str | mujoco.MjSpec = self.model
         keyframe, plain = self.keyframe, None
@@ -77,9 +87,8 @@ class Gap:
         with _shown(console) as show:
             gap = find_gap(
                 model,
-                logs,
+                recordings,
                 plain=plain,
-                mapping=self.mapping,
                 keyframe=keyframe,
                 progress=show,
                 engine=engine,

@@ -1,5 +1,7 @@
 """Write cases: a folder with the nominal model and recordings for the workflow, a label elsewhere for the score.
 
+Beside those of a registered task, ``at_rest.txt`` names the recordings that begin at rest.
+
     python -m benchmarks.hidden_effects.generate --split dev --out DIR --labels OTHER_DIR [--only single]
         [--count 20] [--plants two_link arm3]
 
@@ -19,7 +21,7 @@ import numpy as np
 from benchmarks.hidden_effects.cases import FIRST_SEED, KINDS, Case, cases, equivalents
 from benchmarks.hidden_effects.catalogue import EFFECTS
 from benchmarks.hidden_effects.outside import OUTSIDE
-from benchmarks.hidden_effects.plants import RECORDINGS, Array, nominal_model, plants
+from benchmarks.hidden_effects.plants import RECORDINGS, Array, begins_in_motion, nominal_model, plants
 from benchmarks.hidden_effects.truth import Diverged, Law, World, draw_plain
 
 
@@ -44,6 +46,9 @@ def write_case(case: Case, out: Path, labels: Path) -> Path:
     header = ",".join(column_names(case.plant))
     for i, table in enumerate(tables):
         np.savetxt(folder / f"rec_{i}.csv", table, fmt="%.8g", delimiter=",", header=header, comments="")
+    if plants()[case.plant].says_rest:
+        resting = [f"rec_{i}.csv\n" for i in range(RECORDINGS) if not begins_in_motion(i)]
+        (folder / "at_rest.txt").write_text("".join(resting))
     labels.mkdir(parents=True, exist_ok=True)
     label = {
         "case": case.name,

@@ -58,6 +58,7 @@ class Plant:
         feedback: None where the reference is the command.
         window: seconds within which a prediction from a measured start says something; None: a whole recording.
         exact: what the names of bodies and joints begin with whose parameters are not wrong.
+        says_rest: whether the workflow is told which recordings begin at rest: where a rope is then, nothing else says.
         analysed: recordings from which the least detectable magnitudes are computed; the rest counts as alike.
         places: names of the joints, bodies and so on where effects are hidden; None: anywhere.
     """
@@ -74,6 +75,7 @@ class Plant:
     feedback: Feedback | None = None
     window: float | None = None
     exact: tuple[str, ...] = ()
+    says_rest: bool = False
     analysed: int = RECORDINGS
     places: frozenset[str] | None = None
 
@@ -143,8 +145,13 @@ def _recorded(path: Array, rest: int, cut: int) -> tuple[Array, int]:
 
 
 def _cut(index: int, rng: np.random.Generator, rate: float) -> int:
-    """Samples of motion before the recording begins: every third one begins in motion."""
-    return int(rng.uniform(0.3, 0.8) * rate) if index % 3 == 2 else 0
+    """Samples of motion before the recording begins."""
+    return int(rng.uniform(0.3, 0.8) * rate) if begins_in_motion(index) else 0
+
+
+def begins_in_motion(index: int) -> bool:
+    """Whether a recording begins in motion, every third one, or where the plant has come to rest."""
+    return index % 3 == 2
 
 
 _OPTION = '<option timestep="0.002" integrator="implicitfast"/>'
@@ -329,6 +336,7 @@ def _task(name: str, site: str, fingers: tuple[str, ...], exact: tuple[str, ...]
         sensors=(),
         motion=partial(_task_motion, name),
         exact=exact,
+        says_rest=True,
         analysed=3,
         places=places,
     )

@@ -10,9 +10,18 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from dataclasses import replace
 from pathlib import Path
 
 from simopt_envs.gap import find_gap
+from simopt_envs.measured import Recording, load_recording
+
+
+def recordings(case: Path) -> list[Recording]:
+    """The recordings of a case, those that it says begin at rest marked."""
+    told = case / "at_rest.txt"
+    at_rest = told.read_text().split() if told.exists() else []
+    return [replace(load_recording(path), at_rest=path.name in at_rest) for path in sorted(case.glob("rec_*.csv"))]
 
 
 def main() -> None:
@@ -31,7 +40,7 @@ def main() -> None:
         if target.exists():
             continue
         try:
-            gap = find_gap(case / "model.xml", sorted(case.glob("rec_*.csv")))
+            gap = find_gap(case / "model.xml", recordings(case))
         except (ValueError, RuntimeError) as error:
             print(f"{i + 1}/{len(cases)} {case.name}: FAILED: {error}", flush=True)
             continue

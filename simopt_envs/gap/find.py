@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -22,13 +22,14 @@ from simopt_envs.gap.localise import localise
 from simopt_envs.gap.motion import motion_of
 from simopt_envs.gap.muted import muted
 from simopt_envs.gap.plain import Plain, plain_parameters
-from simopt_envs.gap.recordings import longer_windows, read_windows
+from simopt_envs.gap.recordings import longer_windows, read_windows, whole_from_rest
 from simopt_envs.gap.result import Gap, judge, named_effects, repair
 from simopt_envs.gap.search import Progress, Search
 from simopt_envs.gap.separate import separate
 from simopt_envs.gap.sizes import of_best_length
+from simopt_envs.gap.thresholds import LARGE
 from simopt_envs.gap.trial import Base, Data
-from simopt_envs.gap.wild_starts import without_wild_columns, without_wild_starts
+from simopt_envs.gap.wild_starts import of_linear_starts, without_wild_columns, without_wild_starts
 from simopt_envs.measured.mapping import LogMapping
 from simopt_envs.measured.readers import load_recordings
 from simopt_envs.measured.recording import Recording
@@ -51,6 +52,7 @@ class Problem:
         longer: the recordings in longer windows, the longest first, if they are that long.
         keyframe: where joints without a column start.
         began: when it was read, by ``time.perf_counter``.
+        in_short_windows: reads it so, where the data are whole recordings from rest; None where they are not.
     """
 
     given: mujoco.MjSpec
@@ -60,6 +62,7 @@ class Problem:
     longer: tuple[Data, ...]
     keyframe: str | None
     began: float
+    in_short_windows: Callable[[], Problem] | None = None
 
 
 def find_gap(
@@ -114,12 +117,19 @@ def read(
     logs = [
         r for item in recordings for r in ([item] if isinstance(item, Recording) else load_recordings(item, mapping))
     ]
-    data = read_windows(start.model, logs, keyframe)
+    whole = whole_from_rest(start.model, logs, keyframe)
     motion = motion_of(start.model, logs, keyframe)
+    hypothesis = Hypothesis(start, (), motion)
+
+    def in_short_windows() -> Problem:
+        data = _without_wild_starts(hypothesis, read_windows(start.model, logs, keyframe))
+        return Problem(given, start, data, motion, longer_windows(start.model, data, keyframe), keyframe, began)
+
     with muted():
-        data = _without_wild_starts(start, data, motion)
-    longer = longer_windows(start.model, data, keyframe)
-    return Problem(given, start, data, motion, longer, keyframe, began)
+        data = None if whole is None else _from_rest(hypothesis, whole)
+        if data is None:
+            return in_short_windows()
+    return Problem(given, start, data, motion, (), keyframe, began, in_short_windows)
 
 
 def refitted(problem: Problem, progress: Progress = lambda *_: None) -> Base:
@@ -137,6 +147,11 @@ def solve(
     null: Base | None = None,
 ) -> Gap:
     """What is missing, see :func:`find_gap`; ``null``, if it is there already, is what :func:`refitted` gives."""
+    if problem.in_short_windows is not None:
+        null = null or refitted(problem, progress)
+        if null.excess >= LARGE:
+            with muted():
+                problem, null = problem.in_short_windows(), None
     plain, data = problem.plain, problem.data
     seen = tuple(c for effect in effects for c in _places(effect, plain.model) if _shows(c, plain.model, data.fitted))
     with muted():
@@ -148,12 +163,17 @@ def solve(
         return _gap(problem, found)
 
 
-def _without_wild_starts(plain: Plain, data: Data, motion: Motion) -> Data:
+def _without_wild_starts(hypothesis: Hypothesis, data: Data) -> Data:
     """Without those that the model as given tells."""
-    hypothesis = Hypothesis(plain, (), motion)
     as_given = hypothesis.neutral()
     data = without_wild_columns(hypothesis, as_given, data, Misfit(hypothesis, data.fitted).noise_floor(as_given))
     return without_wild_starts(hypothesis, as_given, data, Misfit(hypothesis, data.fitted).noise_floor(as_given))
+
+
+def _from_rest(hypothesis: Hypothesis, data: Data) -> Data | None:
+    """Recordings from rest, where what is not known of their starts does nothing but what is linear."""
+    as_given, every = hypothesis.neutral(), [np.full(len(w), True) for w in (data.fitted, data.held_out)]
+    return of_linear_starts(hypothesis, as_given, data, Misfit(hypothesis, data.fitted).noise_floor(as_given), every)
 
 
 def _gap(problem: Problem, explanation: Explanation) -> Gap:

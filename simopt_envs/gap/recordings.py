@@ -9,7 +9,7 @@ from functools import partial
 import mujoco
 import numpy as np
 
-from simopt_envs.gap.thresholds import LEAST_LEFT, LONG_WINDOW, WINDOW
+from simopt_envs.gap.thresholds import FROM_REST, LEAST_LEFT, LONG_WINDOW, WINDOW
 from simopt_envs.gap.trial import Data
 from simopt_envs.measured.audit import audited
 from simopt_envs.measured.channels import model_channels
@@ -53,6 +53,37 @@ def read_windows(model: mujoco.MjModel, recordings: Sequence[Recording], keyfram
     Raises:
         ValueError: where the audit found an error, recordings are of different models, or no window fits.
     """
+    checked = _of_one_system(model, recordings)
+    fitted, held_out, warnings = split(checked)
+    seconds = min(WINDOW, *(recording.duration for recording in (*fitted, *held_out)))
+    cut = partial(cut_windows, model, seconds=seconds, keyframe=keyframe, history=2 * LONGEST, centred=True)
+    return Data(cut(fitted), cut(held_out), tuple(fitted), tuple(held_out), warnings + warnings_of(checked))
+
+
+def whole_from_rest(model: mujoco.MjModel, recordings: Sequence[Recording], keyframe: str | None = None) -> Data | None:
+    """Those recordings that begin at rest, each in one window from there, half of them held out.
+
+    None where such windows, of ``LONG_WINDOW`` at most, are fewer than two or hold less than ``FROM_REST`` of all.
+
+    Raises:
+        ValueError: where the audit found an error, or recordings are of different models.
+    """
+    checked = _of_one_system(model, recordings)
+    resting = [recording for recording in checked if recording.at_rest]
+    seconds = min((LONG_WINDOW, *(recording.duration for recording in resting)))
+    if len(resting) < 2 or len(resting) * seconds < FROM_REST * sum(recording.duration for recording in checked):
+        return None
+    fitted, held_out, warnings = split(resting)
+
+    def cut(some: Sequence[Recording]) -> Windows:
+        beginnings = [recording.select(end=recording.time[0] + seconds + recording.period / 2) for recording in some]
+        return cut_windows(model, beginnings, keyframe=keyframe, history=2 * LONGEST)
+
+    return Data(cut(fitted), cut(held_out), tuple(fitted), tuple(held_out), warnings + warnings_of(checked))
+
+
+def _of_one_system(model: mujoco.MjModel, recordings: Sequence[Recording]) -> list[Recording]:
+    """The recordings, audited."""
     for recording in recordings[1:]:
         if set(recording.columns) != set(recordings[0].columns):
             only = set(recording.columns) ^ set(recordings[0].columns)
@@ -60,19 +91,7 @@ def read_windows(model: mujoco.MjModel, recordings: Sequence[Recording], keyfram
                 f"{recording.name} and {recordings[0].name} have different columns ({', '.join(sorted(only))} in one of"
                 " them alone): are they of the same system?"
             )
-    checked = [audited(recording, model) for recording in recordings]
-    fitted, held_out, warnings = split(checked)
-    shortest = min(recording.duration for recording in [*fitted, *held_out])
-    seconds = min(WINDOW, shortest)
-    warnings += warnings_of(checked)
-    cut = partial(cut_windows, model, seconds=seconds, keyframe=keyframe, history=2 * LONGEST, centred=True)
-    return Data(
-        cut(fitted),
-        cut(held_out),
-        tuple(fitted),
-        tuple(held_out),
-        warnings,
-    )
+    return [audited(recording, model) for recording in recordings]
 
 
 def longer_windows(model: mujoco.MjModel, data: Data, keyframe: str | None = None) -> tuple[Data, ...]:

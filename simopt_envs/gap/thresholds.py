@@ -144,5 +144,8 @@ its published values in sight: windows of 0.05 to 3.5 s had been tried on it."""
 LONG_WINDOW = 4.0
 """Seconds of a window at most, where the model is near enough to the data for whole recordings to be predicted."""
 
+FROM_REST = 0.5
+"""Share of what recordings hold that windows must hold which begin where these begin at rest, to be taken alone."""
+
 LEAST_LEFT = 0.9
 """Share of what short windows hold that long ones must hold, without gaps and without those whose start decides."""

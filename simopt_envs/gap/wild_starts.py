@@ -92,16 +92,32 @@ def as_predicted(base: Base, longer: Data) -> Data | None:
     That may be the start of a short window in them. What uncertain starts do must be linear, as it is not where
     contacts slip, and a model that is far off gets lost on the way.
     """
-    both = longer.fitted, longer.held_out
-    kept = [~overlap(windows, longer.wild) for windows in both]
-    if base.excess >= LARGE or np.mean(np.concatenate(kept)) < LEAST_LEFT:
+    kept = [~overlap(windows, longer.wild) for windows in (longer.fitted, longer.held_out)]
+    if base.excess >= LARGE:
         return None
-    for windows, rows in zip(both, kept, strict=True):
-        bent = np.mean(Misfit(base.hypothesis, windows).bent_by_starts(base.fit.u, base.sensor_noise), axis=1)
+    return of_linear_starts(base.hypothesis, base.fit.u, longer, base.sensor_noise, kept)
+
+
+def of_linear_starts(
+    hypothesis: Hypothesis, u: Array, data: Data, scale: Array, kept: Sequence[NDArray[np.bool_]]
+) -> Data | None:
+    """Windows without those in which a start decides; None where what starts do is not linear in the others.
+
+    Args:
+        hypothesis: by which windows are judged.
+        u: its coordinates, (d,).
+        data: the windows.
+        scale: standard deviation of each channel's noise, (c,).
+        kept: which windows are asked about, of those fitted and of those held out, (w,) each.
+    """
+    if np.mean(np.concatenate(kept)) < LEAST_LEFT:
+        return None
+    for windows, rows in zip((data.fitted, data.held_out), kept, strict=True):
+        bent = np.mean(Misfit(hypothesis, windows).bent_by_starts(u, scale), axis=1)
         rows &= bent <= WILD
         if not rows.any() or np.mean(bent[rows]) > BENT:
             return None
-    return _of_those(longer, *kept) if np.mean(np.concatenate(kept)) >= LEAST_LEFT else None
+    return _of_those(data, *kept) if np.mean(np.concatenate(kept)) >= LEAST_LEFT else None
 
 
 def _of_those(data: Data, fitted: NDArray[np.bool_], held_out: NDArray[np.bool_]) -> Data:

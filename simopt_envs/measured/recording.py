@@ -61,12 +61,15 @@ class Recording:
         columns: name -> values, (T,); NaN where a sample is missing.
         name: what to call it in tables and plots.
         warnings: what is known to be wrong with it; carried along by every method.
+        at_rest: whether it begins with everything at rest, and joints without a column at the model's reference or
+            keyframe: what a rope or a drawer then does is known, though nothing shows it.
     """
 
     time: Array
     columns: Mapping[str, Array]
     name: str = "recording"
     warnings: tuple[Finding, ...] = field(default=())
+    at_rest: bool = False
 
     def __post_init__(self) -> None:
         """Raise ValueError where the columns are not as long as the time stamps."""
@@ -207,7 +210,10 @@ class Recording:
         return path
 
     def _rows(self, keep: np.ndarray) -> Recording:
-        return replace(self, time=self.time[keep], columns={n: v[keep] for n, v in self.columns.items()})
+        time = self.time[keep]
+        from_start = bool(len(time)) and time[0] == self.time[0]
+        columns = {name: values[keep] for name, values in self.columns.items()}
+        return replace(self, time=time, columns=columns, at_rest=self.at_rest and from_start)
 
 
 def warnings_of(recordings: Iterable[Recording]) -> tuple[Finding, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import mujoco
@@ -18,6 +18,7 @@ from simopt_envs.physics.parameters import unknown_name
 
 _POSITION_PRIOR = 1.0  # sd of an unmeasured joint around the reference [rad, m]: decides only what nothing sees
 _VELOCITY_PRIOR = 10.0  # the same of its velocity around rest [rad/s, m/s]
+_REST_OFFSET, _REST_SPEED = 0.01, 0.1  # the same of what is said to be at rest: a rope that hangs swings a little
 _SCALAR = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE))
 _LEARNT_FROM = 8  # samples of a recording
 _TOLD = 5.0  # directions in all of these that sites and sensors must tell for that to tell of others
@@ -67,7 +68,8 @@ def estimate_states(
     Measured positions and velocities are smoothed, both of a hinge or slide together; velocities that were not measured
     are derivatives of the smoothed positions. Joints without a column are fitted, from the reference or keyframe, to
     the sites and sensors that depend on positions, and their velocities to the rates of those and to velocity sensors;
-    what nothing sees stays at the reference, at rest.
+    what nothing sees stays at the reference, at rest. Where the recording begins at rest, nothing moves at its first
+    sample, and joints without a column are near the reference.
 
     Args:
         model: the model; its parameters matter only where joints are fitted to sites and sensors.
@@ -85,6 +87,8 @@ def estimate_states(
     smoothed = {c.name: smooth(recording[c.name], recording.period) for c in seen if c.name not in paired}
     for name, rate in paired.items():
         smoothed[name] = smooth_with_rate(recording[name], recording[rate.name], recording.period)
+    if recording.at_rest:
+        smoothed = {name: _from_rest(signal, recording[name][0]) for name, signal in smoothed.items()}
     states, unseen = _by_columns(model, seen, smoothed, samples, keyframe)
     if np.isnan(states.qpos).any():
         raise ValueError(f"{recording.name}: a joint position is missing at a sample whose state is wanted")
@@ -93,7 +97,7 @@ def estimate_states(
         if joints.are_many:
             spread = np.linspace(0, len(recording) - 1, _LEARNT_FROM).round().astype(np.intp)
             joints.learn(_by_columns(model, seen, smoothed, spread, keyframe)[0], spread)
-        joints.fit(states, samples)
+        joints.fit(states, samples, (samples == 0) & recording.at_rest)
     for channel in (c for c in seen if c.kind == "qvel" and c not in paired.values()):
         signal = smoothed[channel.name]
         measured = signal.value[samples]
@@ -101,6 +105,18 @@ def estimate_states(
         states.qvel[good, channel.index] = measured[good]
         states.qvel_error[good, channel.index] = signal.value_error[samples][good]
     return states
+
+
+def _from_rest(signal: Smoothed, first: float) -> Smoothed:
+    """With the first sample at rest, and as it was measured: smoothed, it would be on the way that it sets off on."""
+    return replace(
+        signal,
+        value=np.append(first, signal.value[1:]),
+        velocity=np.append(0.0, signal.velocity[1:]),
+        acceleration=np.append(0.0, signal.acceleration[1:]),
+        value_error=np.append(signal.noise, signal.value_error[1:]),
+        velocity_error=np.append(min(signal.velocity_error[0], _REST_SPEED), signal.velocity_error[1:]),
+    )
 
 
 def _by_columns(
@@ -201,10 +217,12 @@ class _Unseen:
             size = np.where(number < _TOLD, np.inf, np.maximum(size, _LEAST_ERROR))
             self._prior[:, kind] = np.minimum(self._prior[:, kind], size[:, None])
 
-    def fit(self, states: States, samples: NDArray[np.intp]) -> None:
-        """Fit them at some samples, in place."""
-        offset = np.zeros(len(self._dofs))
+    def fit(self, states: States, samples: NDArray[np.intp], resting: NDArray[np.bool_]) -> None:
+        """Fit them at some samples, at some of which they rest, in place."""
+        offset, moving = np.zeros(len(self._dofs)), self._prior
+        at_rest = np.minimum(moving, np.array([[_REST_OFFSET], [_REST_SPEED]]))
         for w, sample in enumerate(samples):
+            self._prior = at_rest if resting[w] else moving
             offset, covariance = self._offset(states.qpos[w], sample, offset)  # the next window starts from here
             states.qpos[w] = self._moved(states.qpos[w], offset)
             states.qpos_error[w, self._dofs] = np.sqrt(np.diag(covariance))

@@ -13,6 +13,7 @@ from simopt_envs.measured.channels import Channel, model_channels
 from simopt_envs.measured.engines import BatchEngine, RolloutEngine, field_sizes
 from simopt_envs.measured.recording import Recording
 from simopt_envs.measured.resample import GAP_PERIODS, Array, hold, longest_interval
+from simopt_envs.measured.rest import holding_commands
 from simopt_envs.measured.states import States, estimate_states
 from simopt_envs.physics.parameters import ParameterSpace
 
@@ -32,7 +33,7 @@ class Windows:
         measured: (w, S, c), NaN where a sample is missing.
         commands: held over each step of the model, (w, N, nu), N = (S - 1) * stride.
         past_commands: those of the steps before the start, oldest first, (w, P, nu): a delayed actuator still sees
-            them.
+            them. Before a recording that begins at rest, those that held the model there.
         starts: the estimated states at the start.
         stride: steps of the model from one sample to the next.
     """
@@ -133,6 +134,9 @@ def cut_windows(
             continue
         measured = np.stack([grid[c.name] for c in channels], axis=-1)
         commands = _commands(model, recording.in_order(), grid.time[starts], timestep, past, stride * (samples - 1))
+        states = estimate_states(model, grid, starts, keyframe)
+        if recording.at_rest and starts[0] == 0:
+            commands[0, :past] = holding_commands(model, states.qpos[0], first=commands[0, past])
         parts.append(
             Windows(
                 channels=channels,
@@ -142,7 +146,7 @@ def cut_windows(
                 measured=measured[starts[:, None] + np.arange(samples)],
                 commands=commands[:, past:],
                 past_commands=commands[:, :past],
-                starts=estimate_states(model, grid, starts, keyframe),
+                starts=states,
                 stride=stride,
             )
         )
