@@ -177,7 +177,7 @@ def _from_rest(hypothesis: Hypothesis, data: Data) -> Data | None:
 
 
 def _gap(problem: Problem, explanation: Explanation) -> Gap:
-    """What was found; where the model errs, and on what that depends, is told from short windows in any case."""
+    """What was found; where the model errs, and on what that depends, is told from half seconds in any case."""
     verdict, short = judge(explanation), problem.data
     null, unforeseen = explanation.null, explanation.final.unforeseen
     explained = explanation if verdict != "unexplained" else replace(explanation, final=null, effects=())
@@ -187,7 +187,8 @@ def _gap(problem: Problem, explanation: Explanation) -> Gap:
     models = [(null.hypothesis, as_given), (null.hypothesis, fitted[0]), (final.hypothesis, fitted[1])]
     errors = held_out_errors(explanation.data.held_out, models, null.sensor_noise, np.random.default_rng(_SEED))
     spec, diff = repair(explained, problem.given, fitted[1])
-    rows = localise(short.held_out, _left_by(null, short.held_out).errors, null.hypothesis.plain.model)
+    left_by_null = _left_by(null, short.held_out).errors
+    rows = localise(short.held_out, left_by_null, null.hypothesis.plain.model, short.parts)
     residuals = [_left_by(final, windows) for windows in (short.fitted, short.held_out)]
     left = describe(final.hypothesis, final.fit.u, residuals)
     named = separate(named_effects(explained), explained, problem.keyframe)

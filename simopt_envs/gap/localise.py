@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 
 from simopt_envs.gap.circumstances import Circumstances, Mask, circumstances
@@ -50,16 +52,25 @@ class Partition:
     parts: dict[str, Mask]
 
 
-def localise(windows: Windows, errors: Array, model: mujoco.MjModel) -> tuple[Row, ...]:
+def localise(windows: Windows, errors: Array, model: mujoco.MjModel, parts: int = 1) -> tuple[Row, ...]:
     """The misfit by channel and regime, largest share first.
 
     Args:
         windows: w windows of S samples of c channels.
         errors: whitened errors there of the model with its plain parameters refitted, (w, S, c).
         model: that the windows were cut for.
+        parts: stretches in a window, of which each counts as one: errors of long windows go together in stretches.
     """
-    present = partitions(circumstances(model, windows))
-    return tabulate(windows.names, errors, np.isfinite(windows.measured), present)
+    length = errors.shape[1] // parts
+
+    def cut(values: NDArray[Any]) -> NDArray[Any]:
+        return values[:, : parts * length].reshape(-1, length, *values.shape[2:])
+
+    present = [
+        Partition(partition.name, {name: cut(mask) for name, mask in partition.parts.items()})
+        for partition in partitions(circumstances(model, windows))
+    ]
+    return tabulate(windows.names, cut(errors), cut(np.isfinite(windows.measured)), present)
 
 
 def partitions(of: Circumstances) -> Iterator[Partition]:

@@ -36,6 +36,7 @@ than noise may be left, for time alone. Since seeds 32000 had, again for time al
 be screened again with another base, too, and a coarse fit that a finer one follows takes no derivatives where it ends.
 Since seeds 33000 had, ``WILD`` is asked of sites and sensors as a whole, where it would leave out most windows (two
 cases of the swing-peg of seeds 30000), and fits in full keep derivatives by what hardly shows, for time alone.
+Since seeds 34000 had, ``FROM_REST`` is new.
 
 What fitted values must be for an effect's name to fit them is with the effects (``Effect.is_itself``): that a cogging
 shows a whole period is asked since seeds 20000 had been run (one case, and one of the gap demonstration).
