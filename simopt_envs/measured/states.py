@@ -206,8 +206,8 @@ class _Unseen:
         offset, known = np.zeros(len(self._dofs)), np.flatnonzero(np.isfinite(states.qpos).all(axis=1))
         for w in known:
             qpos, qvel = states.qpos[w], states.qvel[w]
-            offset, offset_covariance = self._offset(qpos, samples[w], offset)
-            rate, rate_covariance = self._rate(self._moved(qpos, offset), qvel, samples[w])
+            offset, offset_covariance = self._offset(qpos, samples[w], offset, self._prior)
+            rate, rate_covariance = self._rate(self._moved(qpos, offset), qvel, samples[w], self._prior)
             squares += np.square([offset, rate])
             told += 1 - np.array([np.diag(offset_covariance), np.diag(rate_covariance)]) / self._prior**2
         turns = self._turns()
@@ -219,14 +219,14 @@ class _Unseen:
 
     def fit(self, states: States, samples: NDArray[np.intp], resting: NDArray[np.bool_]) -> None:
         """Fit them at some samples, at some of which they rest, in place."""
-        offset, moving = np.zeros(len(self._dofs)), self._prior
-        at_rest = np.minimum(moving, np.array([[_REST_OFFSET], [_REST_SPEED]]))
+        offset = np.zeros(len(self._dofs))
+        at_rest = np.minimum(self._prior, np.array([[_REST_OFFSET], [_REST_SPEED]]))
         for w, sample in enumerate(samples):
-            self._prior = at_rest if resting[w] else moving
-            offset, covariance = self._offset(states.qpos[w], sample, offset)  # the next window starts from here
+            prior = at_rest if resting[w] else self._prior
+            offset, covariance = self._offset(states.qpos[w], sample, offset, prior)  # the next starts from here
             states.qpos[w] = self._moved(states.qpos[w], offset)
             states.qpos_error[w, self._dofs] = np.sqrt(np.diag(covariance))
-            rate, covariance = self._rate(states.qpos[w], states.qvel[w], sample)
+            rate, covariance = self._rate(states.qpos[w], states.qvel[w], sample, prior)
             states.qvel[w, self._dofs] = rate
             states.qvel_error[w, self._dofs] = np.sqrt(np.diag(covariance))
 
@@ -246,7 +246,7 @@ class _Unseen:
         mujoco.mj_integratePos(self._model, qpos, tangent, 1.0)
         return qpos
 
-    def _offset(self, reference: Array, sample: int, start: Array) -> tuple[Array, Array]:
+    def _offset(self, reference: Array, sample: int, start: Array, prior: Array) -> tuple[Array, Array]:
         """How far they are from a reference (nq,), and the covariance of that."""
         targets = self._measured(self._position, "value", sample)
         error = np.maximum(self._measured(self._position, "value_error", sample), _LEAST_ERROR)
@@ -254,12 +254,12 @@ class _Unseen:
         def misfit(offset: Array) -> Array:
             at_rest = np.zeros(self._model.nv)
             values = read_state(self._model, self._data, self._moved(reference, offset), at_rest, self._position)
-            return np.append(np.nan_to_num((values - targets) / error), offset / self._prior[0])
+            return np.append(np.nan_to_num((values - targets) / error), offset / prior[0])
 
         fit = least_squares(misfit, start)
         return fit.x, np.linalg.inv(fit.jac.T @ fit.jac)
 
-    def _rate(self, qpos: Array, known_velocity: Array, sample: int) -> tuple[Array, Array]:
+    def _rate(self, qpos: Array, known_velocity: Array, sample: int, prior: Array) -> tuple[Array, Array]:
         """Their velocities in a posture, and the covariance of these."""
         error = np.append(
             self._measured(self._position, "velocity_error", sample),
@@ -282,7 +282,7 @@ class _Unseen:
         slope = np.array([predicted_rates(base + direction) - at_base for direction in unit]).T.reshape(-1, len(unit))
         finite = np.isfinite(rates)
         rows = slope[finite] / error[finite, None]
-        precision = rows.T @ rows + np.diag(self._prior[1] ** -2.0)
+        precision = rows.T @ rows + np.diag(prior[1] ** -2.0)
         pull = rows.T @ ((rates - at_base)[finite] / error[finite])
         return np.linalg.solve(precision, pull), np.linalg.inv(precision)
 
