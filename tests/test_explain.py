@@ -21,7 +21,7 @@ from baselines.logged_system import LoggedSystem
 from simopt_envs.adaptation import EnvSimulator
 from simopt_envs.distributions import Gaussian
 from simopt_envs.gap.find import find_gap, solve
-from simopt_envs.measured import load_recording
+from simopt_envs.measured import Recording, load_recording
 from simopt_envs.physics import ModelWriter
 from simopt_envs.physics.effects import EFFECTS
 from simopt_envs.tasks.effects import with_effects
@@ -230,6 +230,25 @@ def test_the_gap_command_takes_an_environment(few_effects, tmp_path, capsys):
     assert found["effects"][0]["parameters"]["mass"]["value"] == pytest.approx(2.5, rel=0.05)
     repaired, given = mujoco.MjModel.from_xml_path("out/model.repaired.xml"), environment(DRAWER)[0].compile()
     assert repaired.body_subtreemass[0] - given.body_subtreemass[0] == pytest.approx(2.5, rel=0.05)
+
+
+def test_the_gap_command_is_told_which_recordings_begin_at_rest(monkeypatch, tmp_path, capsys):
+    found: list[Recording] = []
+
+    def noted(model, recordings, **_):
+        found.extend(recordings)
+        raise ValueError("seen")
+
+    monkeypatch.setattr("simopt_envs.gap.find_gap", noted)
+    time = 0.01 * np.arange(20)
+    logs = [str(Recording(time, {"qpos/a": time}).save(tmp_path / f"run_{i}.csv")) for i in range(3)]
+    with pytest.raises(SystemExit):
+        main(["gap", DRAWER, "--data", *logs, "--out", "out", "--at-rest", *logs[1:]])
+    assert [recording.at_rest for recording in found] == [False, True, True]
+    other = str(tmp_path / "other.csv")
+    with pytest.raises(SystemExit):
+        main(["gap", DRAWER, "--data", *logs, "--out", "out", "--at-rest", other])
+    assert f"--at-rest names {other}, which is none of the recordings of --data" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
