@@ -21,6 +21,7 @@ from simopt_envs.gap.outliers import without_outliers
 from simopt_envs.gap.plain import Plain, plain_parameters
 from simopt_envs.gap.recordings import longer_windows, read_windows, whole_from_rest
 from simopt_envs.gap.search import Search
+from simopt_envs.gap.separate import simulated_motions
 from simopt_envs.gap.thresholds import LARGE, WILD
 from simopt_envs.gap.trial import Base, Data
 from simopt_envs.gap.wild_starts import as_predicted, without_wild_starts
@@ -425,6 +426,9 @@ def test_what_acts_in_a_rope_is_named_where_it_is_told_that_it_hangs_at_rest(dam
     assert len(gap.data.fitted.names) == (4 if at_rest else 2)
     assert [str(effect.candidate) for effect in gap.effects] == ["viscous_friction at joint:link1"] * named
     assert gap.verdict == ("named" if named else "none")
+    motions = simulated_motions(gap.explanation.final, gap.data)
+    assert motions
+    assert all(motion.at_rest == at_rest for motion in motions)
 
 
 def test_recordings_from_rest_are_taken_alone_where_they_are_half_of_all_and_short():
@@ -445,6 +449,11 @@ def test_recordings_from_rest_are_taken_alone_where_they_are_half_of_all_and_sho
     assert whole(1, recordings[:1]) is None, "none would be left to hold out"
     long = [replace(recording, time=4.1 * recording.time) for recording in recordings]
     assert whole(6, long) is None, "most of them is far from where they rested"
+    torn = [part(r, (r.time < 0.5) | (r.time > 1.0)) for r in recordings]
+    assert whole(6, torn) is None
+    few = whole(6, [*torn[:3], *recordings[3:]])
+    assert few is not None
+    assert len(few.fitted) + len(few.held_out) == 3
 
 
 @needs_effects

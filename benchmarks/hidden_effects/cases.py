@@ -18,8 +18,8 @@ from benchmarks.hidden_effects.plants import plants
 
 Kind = Literal["single", "null", "outside", "double"]
 KINDS: tuple[Kind, ...] = ("single", "null", "outside", "double")
-FIRST_SEED = {"dev": 0, "test": 36000}
-"""Split -> its first seed. Seeds from 1000, 2000, ... 33000 on were earlier test splits, so they count as seen; with
+FIRST_SEED = {"dev": 0, "test": 37000}
+"""Split -> its first seed. Seeds from 1000, 2000, ... 36000 on were earlier test splits, so they count as seen; with
 which commit each was run is in ``docs/hidden_effects.md``.
 """
 LEVELS = (10.0, 3.0)

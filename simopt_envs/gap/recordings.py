@@ -79,7 +79,11 @@ def whole_from_rest(model: mujoco.MjModel, recordings: Sequence[Recording], keyf
         beginnings = [recording.select(end=recording.time[0] + seconds + recording.period / 2) for recording in some]
         return cut_windows(model, beginnings, keyframe=keyframe, history=2 * LONGEST)
 
-    return Data(cut(fitted), cut(held_out), tuple(fitted), tuple(held_out), warnings + warnings_of(checked))
+    try:
+        parts = cut(fitted), cut(held_out)
+    except ValueError:  # all of one half have gaps
+        return None
+    return Data(*parts, tuple(fitted), tuple(held_out), warnings + warnings_of(checked))
 
 
 def _of_one_system(model: mujoco.MjModel, recordings: Sequence[Recording]) -> list[Recording]:

@@ -70,7 +70,8 @@ def separate(named: Sequence[Named], explanation: Explanation, keyframe: str | N
 def simulated_motions(final: Base, data: Data) -> tuple[Recording, ...]:
     """What the sensors would show of each motion that stays near what was recorded, from the first recorded start.
 
-    A motion may leave the range that a column had by half of it, and move it twice as fast.
+    Where that is at rest, so is the motion's. A motion may leave the range that a column had by half of it, and move it
+    twice as fast.
     """
     recordings = [*data.fitted_recordings, *data.held_out_recordings]
     period = data.fitted.offsets[1]
@@ -90,10 +91,12 @@ def simulated_motions(final: Base, data: Data) -> tuple[Recording, ...]:
         past_commands=data.fitted.past_commands[first],
         starts=data.fitted.starts.select(first),
     )
+    beginning = data.fitted.recording[0], data.fitted.start_time[0]
+    at_rest = any(r.at_rest and (r.name, r.time[0]) == beginning for r in recordings)
     true = final.hypothesis.simulator(windows)(final.hypothesis.xi(final.fit.u[None]))[0]
     shown = true + final.sensor_noise * np.random.default_rng(_SEED).standard_normal(true.shape)
     return tuple(
-        replace(motion, columns={**motion.columns, **dict(zip(windows.names, values.T, strict=True))})
+        replace(motion, columns={**motion.columns, **dict(zip(windows.names, values.T, strict=True))}, at_rest=at_rest)
         for motion, values, near in zip(tried, shown, _is_near(true, data, final.sensor_noise), strict=True)
         if near
     )
