@@ -386,12 +386,12 @@ def test_starts_are_told_apart_by_the_windows_that_a_base_leaves_most_of(count, 
     np.testing.assert_array_equal(Base.worst(base, count), rows)
 
 
-def of_a_hanging_rope(damping: float, at_rest: bool) -> tuple[mujoco.MjSpec, list[Recording]]:
+def of_a_hanging_rope(damping: float, at_rest: bool, load: float = 0.0) -> tuple[mujoco.MjSpec, list[Recording]]:
     """A rope of four links that hangs from a cart, which its drive begins to shake as the recording begins."""
     rope = "<site name='tip' pos='0 0 -0.2'/>" + "</body>" * 4
     for i in reversed(range(4)):
         rope = (
-            f"<body pos='0 0 {-0.2 if i else 0}'><joint name='link{i}' axis='0 1 0' damping='5e-3'/>"
+            f"<body name='part{i}' pos='0 0 {-0.2 if i else 0}'><joint name='link{i}' axis='0 1 0' damping='5e-3'/>"
             f"<geom type='capsule' fromto='0 0 0 0 0 -0.2' size='0.01' mass='0.02'/>{rope}"
         )
     spec = mujoco.MjSpec.from_string(
@@ -402,6 +402,7 @@ def of_a_hanging_rope(damping: float, at_rest: bool) -> tuple[mujoco.MjSpec, lis
     spec.option.disableflags = mujoco.mjtDisableBit.mjDSBL_CONTACT
     model, rng, recordings, time = spec.compile(), np.random.default_rng(0), [], 0.02 * np.arange(101)
     model.joint("link1").damping[:] = damping
+    model.body("part3").mass[:] += load
     for i in range(4):
         data, command, rows = mujoco.MjData(model), 0.1 * np.cos((i + 3) * time), []
         for value in command:
@@ -429,6 +430,16 @@ def test_what_acts_in_a_rope_is_named_where_it_is_told_that_it_hangs_at_rest(dam
     motions = simulated_motions(gap.explanation.final, gap.data)
     assert motions
     assert all(motion.at_rest == at_rest for motion in motions)
+
+
+@needs_effects
+def test_a_rope_from_rest_is_not_cut_where_the_model_is_far_from_it_as_its_tip_would_be_lost():
+    spec, recordings = of_a_hanging_rope(5e-3, True, load=0.3)
+    problem = find.read(spec, recordings)
+    assert find.refitted(problem).excess > LARGE
+    gap = find_gap(spec, recordings, effects=[EFFECTS["payload"]])
+    assert gap.data.seconds == pytest.approx(2.0)
+    assert str(gap.effects[0].candidate) == "payload at body:part3"
 
 
 def test_recordings_from_rest_are_taken_alone_where_they_are_half_of_all_and_short():

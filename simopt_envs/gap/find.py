@@ -151,7 +151,9 @@ def solve(
         null = null or refitted(problem, progress)
         if null.excess >= LARGE:
             with muted():
-                problem, null = problem.in_short_windows(), None
+                short = problem.in_short_windows()
+            if short.data.fitted.names == problem.data.fitted.names:  # they show as much
+                problem, null = short, None
     plain, data = problem.plain, problem.data
     seen = tuple(c for effect in effects for c in _places(effect, plain.model) if _shows(c, plain.model, data.fitted))
     with muted():
