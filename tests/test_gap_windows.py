@@ -220,33 +220,47 @@ def test_windows_whose_start_decides_are_left_out_unless_most_are_such(upright, 
     assert found.fitted.recording == data.fitted.recording[4 - kept :]
 
 
-def of_a_rope(links: int, carts: int = 4) -> tuple[mujoco.MjSpec, list[Recording]]:
-    """A cart that is driven to and fro, from which a rope hangs whose tip alone is seen, going round in big swings."""
+def a_rope(links: int, damping: float, lag: str = "") -> mujoco.MjSpec:
+    """A cart that is driven, from which a rope hangs."""
     rope = "<site name='tip' pos='0 0 -0.2'/>" + "</body>" * links
     for i in reversed(range(links)):
         rope = (
-            f"<body pos='0 0 {-0.2 if i else 0}'><joint name='link{i}' axis='0 1 0' damping='1e-4'/>"
+            f"<body name='part{i}' pos='0 0 {-0.2 if i else 0}'>"
+            f"<joint name='link{i}' axis='0 1 0' damping='{damping}'/>"
             f"<geom type='capsule' fromto='0 0 0 0 0 -0.2' size='0.01' mass='0.02'/>{rope}"
         )
     spec = mujoco.MjSpec.from_string(
         "<mujoco><option timestep='0.002'/><worldbody><body><joint name='cart' type='slide' axis='1 0 0' damping='5'/>"
         f"<geom type='box' size='0.1 0.1 0.1' mass='5'/>{rope}</body></worldbody>"
-        "<actuator><position name='cart' joint='cart' kp='500' kv='50'/></actuator></mujoco>"
+        f"<actuator><position name='cart' joint='cart' kp='500' kv='50' {lag}/></actuator></mujoco>"
     )
     spec.option.disableflags = mujoco.mjtDisableBit.mjDSBL_CONTACT
-    model, rng, recordings, time = spec.compile(), np.random.default_rng(0), [], 0.02 * np.arange(101)
-    for i in range(carts):
-        data, command, rows = mujoco.MjData(model), 0.2 * np.sin((i + 2) * time), []
-        data.qvel[1:] = 8.0
+    return spec
+
+
+def drive(
+    model: mujoco.MjModel, commands: Sequence[np.ndarray], turning: float, noise: Sequence[float]
+) -> list[Recording]:
+    """What is seen of the cart and of the rope's tip where the cart is driven, and the rope turns at first."""
+    rng, recordings = np.random.default_rng(0), []
+    for i, command in enumerate(commands):
+        data, rows = mujoco.MjData(model), []
+        data.qvel[1:] = turning
         for value in command:
             mujoco.mj_kinematics(model, data)
-            rows.append([data.qpos[0], *data.site_xpos[0]] + 1e-4 * rng.standard_normal(4))
+            rows.append([data.qpos[0], *data.site_xpos[0]] + np.array(noise) * rng.standard_normal(4))
             data.ctrl[:] = value
             mujoco.mj_step(model, data, 10)
         names = ("qpos/cart", "site/tip/x", "site/tip/y", "site/tip/z")
         columns = {"ctrl/cart": command, **dict(zip(names, np.array(rows).T, strict=True))}
-        recordings.append(Recording(time, columns, f"run_{i}"))
-    return spec, recordings
+        recordings.append(Recording(0.02 * np.arange(len(command)), columns, f"run_{i}"))
+    return recordings
+
+
+def of_a_rope(links: int) -> tuple[mujoco.MjSpec, list[Recording]]:
+    """A cart that is driven to and fro, from which a rope hangs whose tip alone is seen, going round in big swings."""
+    spec, time = a_rope(links, 1e-4), 0.02 * np.arange(101)
+    return spec, drive(spec.compile(), [0.2 * np.sin((i + 2) * time) for i in range(4)], 8.0, [1e-4] * 4)
 
 
 @needs_effects
@@ -388,32 +402,12 @@ def test_starts_are_told_apart_by_the_windows_that_a_base_leaves_most_of(count, 
 
 def of_a_hanging_rope(damping: float, at_rest: bool, load: float = 0.0) -> tuple[mujoco.MjSpec, list[Recording]]:
     """A rope of four links that hangs from a cart, which its drive begins to shake as the recording begins."""
-    rope = "<site name='tip' pos='0 0 -0.2'/>" + "</body>" * 4
-    for i in reversed(range(4)):
-        rope = (
-            f"<body name='part{i}' pos='0 0 {-0.2 if i else 0}'><joint name='link{i}' axis='0 1 0' damping='5e-3'/>"
-            f"<geom type='capsule' fromto='0 0 0 0 0 -0.2' size='0.01' mass='0.02'/>{rope}"
-        )
-    spec = mujoco.MjSpec.from_string(
-        "<mujoco><option timestep='0.002'/><worldbody><body><joint name='cart' type='slide' axis='1 0 0' damping='5'/>"
-        f"<geom type='box' size='0.1 0.1 0.1' mass='5'/>{rope}</body></worldbody><actuator>"
-        "<position name='cart' joint='cart' kp='500' kv='50' delay='0.01' nsample='8'/></actuator></mujoco>"
-    )
-    spec.option.disableflags = mujoco.mjtDisableBit.mjDSBL_CONTACT
-    model, rng, recordings, time = spec.compile(), np.random.default_rng(0), [], 0.02 * np.arange(101)
+    spec, time = a_rope(4, 5e-3, "delay='0.01' nsample='8'"), 0.02 * np.arange(101)
+    model = spec.compile()
     model.joint("link1").damping[:] = damping
     model.body("part3").mass[:] += load
-    for i in range(4):
-        data, command, rows = mujoco.MjData(model), 0.1 * np.cos((i + 3) * time), []
-        for value in command:
-            mujoco.mj_kinematics(model, data)
-            rows.append([data.qpos[0], *data.site_xpos[0]] + np.array([2e-4, *[1e-3] * 3]) * rng.standard_normal(4))
-            data.ctrl[:] = value
-            mujoco.mj_step(model, data, 10)
-        names = ("qpos/cart", "site/tip/x", "site/tip/y", "site/tip/z")
-        columns = {"ctrl/cart": command, **dict(zip(names, np.array(rows).T, strict=True))}
-        recordings.append(Recording(time, columns, f"run_{i}", at_rest=at_rest))
-    return spec, recordings
+    recordings = drive(model, [0.1 * np.cos((i + 3) * time) for i in range(4)], 0.0, [2e-4, 1e-3, 1e-3, 1e-3])
+    return spec, [replace(recording, at_rest=at_rest) for recording in recordings]
 
 
 @needs_effects
