@@ -21,17 +21,30 @@ _GUARD = 0.5  # seconds between what is fitted of a single recording and what is
 _FITTED = 0.6  # share of a single recording that is fitted
 
 
+def of_one_system(model: mujoco.MjModel, recordings: Sequence[Recording]) -> list[Recording]:
+    """The recordings, each audited, with what the audit found attached.
+
+    Raises:
+        ValueError: without recordings, where the audit found an error, or where recordings are of different models.
+    """
+    if not recordings:
+        raise ValueError("a gap search needs at least one recording")
+    for recording in recordings[1:]:
+        if set(recording.columns) != set(recordings[0].columns):
+            only = set(recording.columns) ^ set(recordings[0].columns)
+            raise ValueError(
+                f"{recording.name} and {recordings[0].name} have different columns ({', '.join(sorted(only))} in one of"
+                " them alone): are they of the same system?"
+            )
+    return [audited(recording, model) for recording in recordings]
+
+
 def split(recordings: Sequence[Recording]) -> tuple[list[Recording], list[Recording], tuple[Finding, ...]]:
     """The recordings to fit and those held out, and a warning where that could not be done by recording.
 
     In the order of how fast they move, the fastest and the slowest are fitted, so that what is held out lies within
     what was fitted: much of what a model may lack shows at speed alone, or where things stick.
-
-    Raises:
-        ValueError: without recordings.
     """
-    if not recordings:
-        raise ValueError("a gap search needs at least one recording")
     if len(recordings) == 1:
         fitted, held_out = recordings[0].split(_FITTED, _GUARD)
         only = Finding.warning(
@@ -51,27 +64,22 @@ def read_windows(model: mujoco.MjModel, recordings: Sequence[Recording], keyfram
     that sets off where its recording begins would seem to be on its way already.
 
     Raises:
-        ValueError: where the audit found an error, recordings are of different models, or no window fits.
+        ValueError: where no window fits.
     """
-    checked = _of_one_system(model, recordings)
-    fitted, held_out, warnings = split(checked)
+    fitted, held_out, warnings = split(recordings)
     seconds = min(WINDOW, *(recording.duration for recording in (*fitted, *held_out)))
     cut = partial(cut_windows, model, seconds=seconds, keyframe=keyframe, history=2 * LONGEST, centred=True)
-    return Data(cut(fitted), cut(held_out), tuple(fitted), tuple(held_out), warnings + warnings_of(checked))
+    return Data(cut(fitted), cut(held_out), tuple(fitted), tuple(held_out), warnings + warnings_of(recordings))
 
 
 def whole_from_rest(model: mujoco.MjModel, recordings: Sequence[Recording], keyframe: str | None = None) -> Data | None:
     """Those recordings that begin at rest, each in one window from there, half of them held out.
 
     None where such windows, of ``LONG_WINDOW`` at most, are fewer than two or hold less than ``FROM_REST`` of all.
-
-    Raises:
-        ValueError: where the audit found an error, or recordings are of different models.
     """
-    checked = _of_one_system(model, recordings)
-    resting = [recording for recording in checked if recording.at_rest]
+    resting = [recording for recording in recordings if recording.at_rest]
     seconds = min((LONG_WINDOW, *(recording.duration for recording in resting)))
-    if len(resting) < 2 or len(resting) * seconds < FROM_REST * sum(recording.duration for recording in checked):
+    if len(resting) < 2 or len(resting) * seconds < FROM_REST * sum(recording.duration for recording in recordings):
         return None
     fitted, held_out, warnings = split(resting)
 
@@ -83,19 +91,7 @@ def whole_from_rest(model: mujoco.MjModel, recordings: Sequence[Recording], keyf
         parts = cut(fitted), cut(held_out)
     except ValueError:  # all of one half have gaps
         return None
-    return Data(*parts, tuple(fitted), tuple(held_out), warnings + warnings_of(checked))
-
-
-def _of_one_system(model: mujoco.MjModel, recordings: Sequence[Recording]) -> list[Recording]:
-    """The recordings, audited."""
-    for recording in recordings[1:]:
-        if set(recording.columns) != set(recordings[0].columns):
-            only = set(recording.columns) ^ set(recordings[0].columns)
-            raise ValueError(
-                f"{recording.name} and {recordings[0].name} have different columns ({', '.join(sorted(only))} in one of"
-                " them alone): are they of the same system?"
-            )
-    return [audited(recording, model) for recording in recordings]
+    return Data(*parts, tuple(fitted), tuple(held_out), warnings + warnings_of(recordings))
 
 
 def longer_windows(model: mujoco.MjModel, data: Data, keyframe: str | None = None) -> tuple[Data, ...]:
