@@ -22,6 +22,7 @@ _REST_OFFSET, _REST_SPEED = 0.01, 0.1  # the same of what is said to be at rest:
 _SCALAR = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE))
 _LEARNT_FROM = 8  # samples of a recording
 _TOLD = 5.0  # directions in all of these that sites and sensors must tell for that to tell of others
+_CLOSE = 1e-5  # share of squares and offsets that a step of a fit changes when it ends: far less than noise
 _LEAST_ERROR = 1e-6  # no measurement counts as more exact than this
 
 
@@ -256,7 +257,7 @@ class _Unseen:
             values = read_state(self._model, self._data, self._moved(reference, offset), at_rest, self._position)
             return np.append(np.nan_to_num((values - targets) / error), offset / prior[0])
 
-        fit = least_squares(misfit, start)
+        fit = least_squares(misfit, start, ftol=_CLOSE, xtol=_CLOSE)
         return fit.x, np.linalg.inv(fit.jac.T @ fit.jac)
 
     def _rate(self, qpos: Array, known_velocity: Array, sample: int, prior: Array) -> tuple[Array, Array]:
