@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from conftest import needs_effects
 from gap_plant import MODEL, record
+from hanging import LOOSE, a_rope, drive, hanging, part, swing
 
 from simopt_envs.gap import find, find_gap, wild_starts
 from simopt_envs.gap.fit import Misfit, by_part
@@ -19,9 +20,8 @@ from simopt_envs.gap.hypothesis import Candidate, Hypothesis
 from simopt_envs.gap.motion import motion_of
 from simopt_envs.gap.outliers import without_outliers
 from simopt_envs.gap.plain import Plain, plain_parameters
-from simopt_envs.gap.recordings import longer_windows, read_windows, whole_from_rest
+from simopt_envs.gap.recordings import longer_windows, read_windows
 from simopt_envs.gap.search import Search
-from simopt_envs.gap.separate import simulated_motions
 from simopt_envs.gap.thresholds import LARGE, WILD
 from simopt_envs.gap.trial import Base, Data
 from simopt_envs.gap.wild_starts import as_predicted, without_wild_starts
@@ -30,41 +30,7 @@ from simopt_envs.measured.replay import start_curvature
 from simopt_envs.measured.windows import Windows
 from simopt_envs.physics.effects import EFFECTS
 
-LOOSE = """
-<mujoco>
-  <option timestep="0.002" integrator="implicitfast" gravity="0 0 {gravity}"/>
-  <worldbody>
-    <body name="rod">
-      <joint name="hinge" axis="0 1 0" damping="0.01"/>
-      <geom type="capsule" fromto="0 0 0 0 0 0.5" size="0.02" mass="1"/>
-    </body>
-  </worldbody>
-  <actuator><motor name="hinge" joint="hinge"/></actuator>
-</mujoco>
-"""
-
 BIAS = Candidate(EFFECTS["actuator_bias"], "actuator:hinge")
-
-
-def swing(
-    model: mujoco.MjModel, starts: Sequence[float], rng: np.random.Generator, push: float = 0.0
-) -> list[Recording]:
-    """The rod from some angles, by a small torque and one that nothing tells; its sensor has 1 mrad of noise."""
-    recordings, time = [], 0.01 * np.arange(201)
-    for i, start in enumerate(starts):
-        data, torque, angle = mujoco.MjData(model), 0.3 * np.sin((i + 2) * time), np.empty(201)
-        data.qpos[:] = start
-        for k in range(201):
-            angle[k] = data.qpos[0] + 1e-3 * rng.standard_normal()
-            data.ctrl[:] = torque[k] + push
-            mujoco.mj_step(model, data, 5)
-        recordings.append(Recording(time, {"ctrl/hinge": torque, "qpos/hinge": angle}, f"run_{i}"))
-    return recordings
-
-
-def hanging(count: int) -> list[float]:
-    """Where so many rods begin, each a little farther from rest."""
-    return [np.pi + 0.1 * i for i in range(count)]
 
 
 def of_rods(upright: int) -> tuple[Data, Hypothesis]:
@@ -91,11 +57,6 @@ def predicted(gravity: float, starts: Sequence[float], wild: tuple[tuple[str, fl
     data = replace(read_windows(plain.model, recordings), wild=wild)
     base = Search(plain, data, motion_of(plain.model, recordings), ()).base()
     return as_predicted(base, longer_windows(plain.model, data)[0])
-
-
-def part(recording: Recording, kept: np.ndarray) -> Recording:
-    columns = {name: values[kept] for name, values in recording.columns.items()}
-    return replace(recording, time=recording.time[kept], columns=columns)
 
 
 def test_errors_are_summed_over_the_parts_of_each_window():
@@ -218,43 +179,6 @@ def test_windows_whose_start_decides_are_left_out_unless_most_are_such(upright, 
     found = without_wild_starts(hypothesis, hypothesis.neutral(), data, np.array([1e-3]))
     assert (len(found.held_out), len(found.warnings)) == (kept, told)
     assert found.fitted.recording == data.fitted.recording[4 - kept :]
-
-
-def a_rope(links: int, damping: float, lag: str = "") -> mujoco.MjSpec:
-    """A cart that is driven, from which a rope hangs."""
-    rope = "<site name='tip' pos='0 0 -0.2'/>" + "</body>" * links
-    for i in reversed(range(links)):
-        rope = (
-            f"<body name='part{i}' pos='0 0 {-0.2 if i else 0}'>"
-            f"<joint name='link{i}' axis='0 1 0' damping='{damping}'/>"
-            f"<geom type='capsule' fromto='0 0 0 0 0 -0.2' size='0.01' mass='0.02'/>{rope}"
-        )
-    spec = mujoco.MjSpec.from_string(
-        "<mujoco><option timestep='0.002'/><worldbody><body><joint name='cart' type='slide' axis='1 0 0' damping='5'/>"
-        f"<geom type='box' size='0.1 0.1 0.1' mass='5'/>{rope}</body></worldbody>"
-        f"<actuator><position name='cart' joint='cart' kp='500' kv='50' {lag}/></actuator></mujoco>"
-    )
-    spec.option.disableflags = mujoco.mjtDisableBit.mjDSBL_CONTACT
-    return spec
-
-
-def drive(
-    model: mujoco.MjModel, commands: Sequence[np.ndarray], turning: float, noise: Sequence[float]
-) -> list[Recording]:
-    """What is seen of the cart and of the rope's tip where the cart is driven, and the rope turns at first."""
-    rng, recordings = np.random.default_rng(0), []
-    for i, command in enumerate(commands):
-        data, rows = mujoco.MjData(model), []
-        data.qvel[1:] = turning
-        for value in command:
-            mujoco.mj_kinematics(model, data)
-            rows.append([data.qpos[0], *data.site_xpos[0]] + np.array(noise) * rng.standard_normal(4))
-            data.ctrl[:] = value
-            mujoco.mj_step(model, data, 10)
-        names = ("qpos/cart", "site/tip/x", "site/tip/y", "site/tip/z")
-        columns = {"ctrl/cart": command, **dict(zip(names, np.array(rows).T, strict=True))}
-        recordings.append(Recording(0.02 * np.arange(len(command)), columns, f"run_{i}"))
-    return recordings
 
 
 def of_a_rope(links: int) -> tuple[mujoco.MjSpec, list[Recording]]:
@@ -398,75 +322,3 @@ def test_windows_keep_off_both_ends_of_a_recording():
 def test_starts_are_told_apart_by_the_windows_that_a_base_leaves_most_of(count, rows):
     base: Any = SimpleNamespace(fit=SimpleNamespace(errors=np.array([1.0, 0.5, -4.0, 2.0]).reshape(4, 1, 1)))
     np.testing.assert_array_equal(Base.worst(base, count), rows)
-
-
-def of_a_hanging_rope(damping: float, at_rest: bool, load: float = 0.0) -> tuple[mujoco.MjSpec, list[Recording]]:
-    """A rope of four links that hangs from a cart, which its drive begins to shake as the recording begins."""
-    spec, time = a_rope(4, 5e-3, "delay='0.01' nsample='8'"), 0.02 * np.arange(101)
-    model = spec.compile()
-    model.joint("link1").damping[:] = damping
-    model.body("part3").mass[:] += load
-    recordings = drive(model, [0.1 * np.cos((i + 3) * time) for i in range(4)], 0.0, [2e-4, 1e-3, 1e-3, 1e-3])
-    return spec, [replace(recording, at_rest=at_rest) for recording in recordings]
-
-
-@needs_effects
-@pytest.mark.parametrize(
-    ("damping", "at_rest", "named"), [(2e-2, True, True), (2e-2, False, False), (5e-3, True, False)]
-)
-def test_what_acts_in_a_rope_is_named_where_it_is_told_that_it_hangs_at_rest(damping, at_rest, named):
-    spec, recordings = of_a_hanging_rope(damping, at_rest)
-    gap = find_gap(spec, recordings, effects=[EFFECTS["viscous_friction"], EFFECTS["joint_spring"]])
-    assert gap.data.seconds == pytest.approx(2.0 if at_rest else 0.5)
-    assert len(gap.data.fitted.names) == (4 if at_rest else 2)
-    assert [str(effect.candidate) for effect in gap.effects] == ["viscous_friction at joint:link1"] * named
-    assert gap.verdict == ("named" if named else "none")
-    motions = simulated_motions(gap.explanation.final, gap.data)
-    assert motions
-    assert all(motion.at_rest == at_rest for motion in motions)
-
-
-@needs_effects
-def test_a_rope_from_rest_is_not_cut_where_the_model_is_far_from_it_as_its_tip_would_be_lost():
-    spec, recordings = of_a_hanging_rope(5e-3, True, load=0.3)
-    problem = find.read(spec, recordings)
-    assert find.refitted(problem).excess > LARGE
-    gap = find_gap(spec, recordings, effects=[EFFECTS["payload"]])
-    assert gap.data.seconds == pytest.approx(2.0)
-    assert str(gap.effects[0].candidate) == "payload at body:part3"
-
-
-def test_recordings_from_rest_are_taken_alone_where_they_are_half_of_all_and_short():
-    model = mujoco.MjModel.from_xml_string(LOOSE.format(gravity=-9.81))
-    recordings = swing(model, hanging(6), np.random.default_rng(0))
-
-    def whole(resting: int, of: Sequence[Recording] = recordings) -> Data | None:
-        return whole_from_rest(model, [replace(r, at_rest=i < resting) for i, r in enumerate(of)])
-
-    data = whole(4)
-    assert data is not None
-    assert {*data.fitted.recording, *data.held_out.recording} == {f"run_{i}" for i in range(4)}
-    assert data.seconds == pytest.approx(2.0)
-    np.testing.assert_array_equal(data.fitted.start_time, 0.0)
-    assert whole(3) is not None
-    assert whole(2) is None
-    assert whole(0) is None
-    assert whole(1, recordings[:1]) is None, "none would be left to hold out"
-    long = [replace(recording, time=4.1 * recording.time) for recording in recordings]
-    assert whole(6, long) is None, "most of them is far from where they rested"
-    torn = [part(r, (r.time < 0.5) | (r.time > 1.0)) for r in recordings]
-    assert whole(6, torn) is None
-    few = whole(6, [*torn[:3], *recordings[3:]])
-    assert few is not None
-    assert len(few.fitted) + len(few.held_out) == 3
-
-
-@needs_effects
-@pytest.mark.parametrize(("push", "seconds"), [(0.0, 2.0), (1.0, 0.5)])
-def test_recordings_from_rest_are_cut_where_a_model_is_far_from_them(push, seconds):
-    """The rod from where it hangs; a push that nothing tells leaves hundreds of times the noise."""
-    spec = mujoco.MjSpec.from_string(LOOSE.format(gravity=-9.81).replace('name="hinge" axis', 'name="hinge" axis'))
-    recordings = [replace(r, at_rest=True) for r in swing(spec.compile(), [np.pi] * 4, np.random.default_rng(0), push)]
-    assert find.read(spec, recordings).data.seconds == pytest.approx(2.0)
-    gap = find_gap(spec, recordings, effects=[EFFECTS["sensor_bias"]])
-    assert gap.data.seconds == pytest.approx(seconds)

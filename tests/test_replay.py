@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import os
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,8 +26,6 @@ from simopt_envs.measured import (
     simulate_windows,
 )
 from simopt_envs.measured import windows as windows_module
-from simopt_envs.measured.engines import settle_actuators
-from simopt_envs.measured.rest import holding_commands
 from simopt_envs.physics import Parameter, ParameterSpace, Write
 
 EXAMPLES = Path(__file__).parents[1] / "simopt_envs" / "measured" / "examples"
@@ -38,32 +35,6 @@ needs_data = pytest.mark.skipif(
 )
 
 # A cart with a swinging link: commands with a delay and a filter, position, velocity and acceleration sensors, a site.
-HUNG = """
-<mujoco>
-  <option timestep="0.002" integrator="implicitfast"/>
-  <worldbody>
-    <body>
-      <joint name="arm" axis="0 -1 0" damping="5"/>
-      <geom type="capsule" fromto="0 0 0 0.6 0 0" size="0.02" mass="1"/>
-    </body>
-    <body pos="0 1 0">
-      <joint name="cart" type="slide" axis="1 0 0" damping="5"/>
-      <geom type="box" size="0.1 0.1 0.1" mass="1"/>
-      <body>
-        <joint name="rod" axis="0 1 0" damping="1e-3"/>
-        <geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.02" mass="0.1"/>
-        <site name="tip" pos="0 0 -0.3"/>
-      </body>
-    </body>
-  </worldbody>
-  <actuator>
-    <position name="arm" joint="arm" kp="200" kv="5" delay="0.02" nsample="12"/>
-    <motor name="cart" joint="cart"/>
-  </actuator>
-</mujoco>
-"""
-HELD = np.array([-0.4, 0.2, 0.0])
-
 CART = """
 <mujoco>
   <option timestep="0.002" integrator="implicitfast"/>
@@ -297,62 +268,6 @@ def test_of_joints_that_one_site_tells_little_of_no_more_is_unknown_than_it_show
         rates.append((states.qvel - centred(qvel)[samples]) / states.qvel_error)
     assert 0.4 < np.std(off) < 1.6
     assert 0.4 < np.std(rates) < 1.6
-
-
-def from_rest(columns: Sequence[str]) -> tuple[mujoco.MjModel, Recording]:
-    """A servo that lags by 20 ms and is sent off by a step as the recording begins; a pendulum hangs from it."""
-    model = mujoco.MjModel.from_xml_string(HUNG)
-    data, rows, rng = mujoco.MjData(model), [], np.random.default_rng(0)
-    data.qpos[:] = HELD
-    held = np.tile(holding_commands(model, data.qpos, np.full(2, np.nan)), (20, 1))
-    settle_actuators(model, data, held)
-    for _ in range(100):
-        mujoco.mj_kinematics(model, data)
-        rows.append(np.concatenate([data.qpos, data.site_xpos[0]]) + 1e-4 * rng.standard_normal(6))
-        data.ctrl[:] = 0.5, 0.0
-        mujoco.mj_step(model, data, 5)
-    names = ("qpos/arm", "qpos/cart", "qpos/rod", "site/tip/x", "site/tip/y", "site/tip/z")
-    measured = dict(zip(names, np.array(rows).T, strict=True))
-    commands = {"ctrl/arm": np.full(100, 0.5), "ctrl/cart": np.zeros(100)}
-    log = Recording(0.01 * np.arange(100), {**commands, **{name: measured[name] for name in columns}}, at_rest=True)
-    return model, log
-
-
-def test_commands_that_hold_are_those_of_the_weight_in_servos_and_of_others_the_first():
-    model = mujoco.MjModel.from_xml_string(HUNG)
-    data = mujoco.MjData(model)
-    data.qpos[:] = HELD
-    held = holding_commands(model, HELD, np.full(2, np.nan))
-    weight = 1.0 * 9.81 * 0.3 * np.cos(HELD[0])
-    assert held == pytest.approx([HELD[0] + weight / 200, 0.0], abs=1e-9)
-    settle_actuators(model, data, np.tile(held, (20, 1)))
-    data.ctrl[:] = held
-    mujoco.mj_step(model, data, 500)
-    np.testing.assert_allclose(data.qpos, HELD, atol=1e-6)
-    model.actuator_forcelimited[0], model.actuator_forcerange[0] = 1, (-1.0, 1.0)
-    assert holding_commands(model, HELD, np.array([0.7, 0.8]))[0] == 0.7, "too weak to hold it"
-
-
-def test_a_recording_from_rest_starts_at_rest_and_what_nothing_shows_near_its_reference():
-    model, log = from_rest(["qpos/arm", "qpos/cart"])
-    samples = np.array([0, 50])
-    told, untold = (estimate_states(model, replace(log, at_rest=rest), samples) for rest in (True, False))
-    np.testing.assert_array_equal(told.qvel[0], 0.0)
-    assert told.qpos[0, :2] == pytest.approx(HELD[:2], abs=4e-4)
-    assert (told.qpos_error[0, 2], told.qvel_error[0, 2]) == pytest.approx((0.01, 0.1))
-    assert untold.qpos_error[0, 2] > 0.9
-    for states in zip(vars(told).values(), vars(untold).values(), strict=True):
-        np.testing.assert_array_equal(states[0][1], states[1][1], err_msg="later on, nothing is told")
-
-
-def test_a_drive_that_lags_holds_on_where_a_recording_begins_at_rest():
-    model, log = from_rest(["qpos/arm", "qpos/cart", "site/tip/x", "site/tip/y", "site/tip/z"])
-    right, wrong = (replay(model, replace(log, at_rest=rest)) for rest in (True, False))
-    assert right.rmse[0, 0] < 3e-4
-    assert wrong.rmse[0, 0] > 1e-2
-    part = cut_windows(model, log, seconds=0.2)
-    np.testing.assert_array_equal(part.past_commands[1:, :, 0], 0.5)
-    assert part.past_commands[0, :, 0].max() < 0.0
 
 
 def test_a_keyframe_replaces_the_reference():
