@@ -44,6 +44,18 @@ class Wave:
         return np.column_stack([swing, np.sin(40.0 * joints[:, 3])])
 
 
+class Sway:
+    """Swings the arm and what hangs from it, by the time alone; no two episodes alike."""
+
+    def __init__(self):
+        self.step = 0
+
+    def act(self, observations):
+        self.step += 1
+        episode = np.arange(len(observations))[:, None]
+        return 0.5 * np.sin(0.08 * (2.2 + 0.75 * episode) * self.step + 0.9 * np.arange(7) + 1.7 * episode)
+
+
 class Untrained:
     """Its policy needs no training, and is interrupted at one of its steps."""
 
@@ -311,6 +323,35 @@ def test_the_search_starts_from_the_distribution_that_leaves_least(tmp_path, mon
         with pytest.raises(InterruptedError):
             explain(DRAWER, distributions, logs, tmp_path / "gap", Console())
         assert searched.pop() == pytest.approx((space.nominal[0], 0.1))
+
+
+def test_logs_of_episodes_are_read_as_beginning_at_rest(tmp_path, monkeypatch):
+    log = Recording(0.01 * np.arange(100), {"qpos/joint1": np.zeros(100)}).save(tmp_path / "log.npz")
+
+    def read(spec, recordings, plain, keyframe):
+        assert [recording.at_rest for recording in recordings] == [True, True]
+        raise InterruptedError
+
+    monkeypatch.setattr("simopt_envs.gap.find.read", read)
+    first = Gaussian.around_nominal(gym.make(DRAWER).unwrapped.parameters.subset(["joint_damping_2"]), std=0.1)
+    with pytest.raises(InterruptedError):
+        explain(DRAWER, [first], [log, log], tmp_path / "gap", Console())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mass", [0.0, 0.01])
+def test_a_knot_in_the_rope_is_told_by_the_peg_that_hangs_from_it(mass, few_effects):
+    """What moves unseen is known where episodes begin; half seconds in between, of the arm alone, show nothing."""
+    knot = {"effect": "payload", "where": "body:segment4", "parameters": {"mass": mass}}
+    robot = LoggedSystem(with_effects(SWING_PEG, [knot] if mass else []), Path("recordings"), noise=0.002)
+    logs = [robot.log(trajectory) for trajectory in robot.rollout(Sway(), 6, np.random.default_rng(0))]
+    space = EnvSimulator(SWING_PEG).parameters
+    prior = inputs.distribution(SWING_PEG, space, ("joint_damping_2=0.05", "rope_bending_damping=0.1"))
+    assert explain(SWING_PEG, [prior], logs, Path("gap"), Console()) == (mass == 0.0)
+    if mass:
+        (found,) = json.loads(Path("gap/gap.json").read_text())["effects"]
+        assert (found["effect"], found["where"]) == ("payload", "body:segment4")
+        assert found["parameters"]["mass"]["value"] == pytest.approx(mass, rel=0.1)
 
 
 def test_effects_join_xi_with_their_intervals_but_for_what_an_environment_does_not_have():

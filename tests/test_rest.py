@@ -12,7 +12,7 @@ from conftest import needs_effects
 from hanging import LOOSE, a_rope, drive, hanging, part, swing
 
 from simopt_envs.gap import find, find_gap
-from simopt_envs.gap.recordings import whole_from_rest
+from simopt_envs.gap.recordings import under_way, whole_from_rest
 from simopt_envs.gap.separate import simulated_motions
 from simopt_envs.gap.thresholds import LARGE
 from simopt_envs.gap.trial import Data
@@ -164,6 +164,14 @@ def test_recordings_from_rest_are_taken_alone_where_they_are_half_of_all_and_sho
     few = whole(6, [*torn[:3], *recordings[3:]])
     assert few is not None
     assert len(few.fitted) + len(few.held_out) == 3
+
+
+def test_short_windows_leave_out_how_recordings_set_off_from_rest():
+    time = 0.01 * np.arange(101)
+    resting = Recording(time, {"qpos/hinge": np.sin(time)}, at_rest=True)
+    later = under_way([resting, replace(resting, at_rest=False), resting.select(end=0.5)])
+    assert [recording.time[0] for recording in later] == pytest.approx([0.1, 0.0, 0.0])
+    assert [recording.at_rest for recording in later] == [False, False, True]
 
 
 @needs_effects

@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 
 _HOME = "home"  # keyframe of an environment's model where its joints are when an episode begins
 _FITS = ".fits"
-_JERK = 0.1  # s at the start of an episode in which an arm jerks off from rest, which no smoothed position shows
 
 
 @dataclass(frozen=True)
@@ -116,7 +115,7 @@ def explain(
     Args:
         env_id: an environment of this package.
         distributions: p(ξ), each of which may explain the logs.
-        logs: of :class:`~baselines.logged_system.LoggedSystem`, two at least.
+        logs: of :class:`~baselines.logged_system.LoggedSystem`, two at least; episodes begin at rest.
         folder: for ``gap.json``, ``report.html`` and the repaired model, if more than noise is left. What is there
             already is kept, and a search that was stopped goes on from its finished fits.
         console: shows the progress.
@@ -134,7 +133,7 @@ def explain(
 
     if (folder / "gap.json").exists() and not (folder / _FITS).exists():
         return False
-    recordings = [load_recording(log).select(start=_JERK) for log in logs]
+    recordings = [replace(load_recording(log), at_rest=True) for log in logs]
     with _shown(console) as show:
         tried = []
         for distribution in distributions:

@@ -22,7 +22,7 @@ from simopt_envs.gap.localise import localise
 from simopt_envs.gap.motion import motion_of
 from simopt_envs.gap.muted import muted
 from simopt_envs.gap.plain import Plain, plain_parameters
-from simopt_envs.gap.recordings import longer_windows, of_one_system, read_windows, whole_from_rest
+from simopt_envs.gap.recordings import longer_windows, of_one_system, read_windows, under_way, whole_from_rest
 from simopt_envs.gap.result import Gap, judge, named_effects, repair
 from simopt_envs.gap.search import Progress, Search
 from simopt_envs.gap.separate import separate
@@ -119,6 +119,7 @@ def read(
     ]
     logs = of_one_system(start.model, logs)
     whole = whole_from_rest(start.model, logs, keyframe)
+    logs = under_way(logs)
     motion = motion_of(start.model, logs, keyframe)
     hypothesis = Hypothesis(start, (), motion)
 

@@ -19,6 +19,7 @@ from simopt_envs.physics.effects.actuator_delay import LONGEST
 
 _GUARD = 0.5  # seconds between what is fitted of a single recording and what is held out
 _FITTED = 0.6  # share of a single recording that is fitted
+_JERK = 0.1  # s from rest on, in which what sets off jerks: no smoothed position shows that
 
 
 def of_one_system(model: mujoco.MjModel, recordings: Sequence[Recording]) -> list[Recording]:
@@ -37,6 +38,11 @@ def of_one_system(model: mujoco.MjModel, recordings: Sequence[Recording]) -> lis
                 " them alone): are they of the same system?"
             )
     return [audited(recording, model) for recording in recordings]
+
+
+def under_way(recordings: Sequence[Recording]) -> list[Recording]:
+    """The recordings without how they set off from rest, as far as they are long enough: smoothed states err there."""
+    return [r.select(start=r.time[0] + _JERK) if r.at_rest and r.duration >= WINDOW + _JERK else r for r in recordings]
 
 
 def split(recordings: Sequence[Recording]) -> tuple[list[Recording], list[Recording], tuple[Finding, ...]]:
