@@ -4,6 +4,7 @@ import json
 import shutil
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium as gym
 import mujoco
@@ -21,7 +22,7 @@ from baselines.logged_system import LoggedSystem
 from simopt_envs.adaptation import EnvSimulator
 from simopt_envs.distributions import Gaussian
 from simopt_envs.gap.find import find_gap, solve
-from simopt_envs.measured import Recording, load_recording
+from simopt_envs.measured import Finding, Recording, load_recording
 from simopt_envs.physics import ModelWriter
 from simopt_envs.physics.effects import EFFECTS
 from simopt_envs.tasks.effects import with_effects
@@ -96,7 +97,8 @@ def asked(monkeypatch):
     """The logs that were handed over, a list for each time; they count as explained."""
     calls = []
     monkeypatch.setattr(
-        "baselines.commands.adapt.explain", lambda env_id, distributions, logs, *_: calls.append(list(logs)) or True
+        "baselines.commands.adapt.explain",
+        lambda env_id, distributions, logs, *_: calls.append(list(logs)) or "It is noise.",
     )
     return calls
 
@@ -338,6 +340,20 @@ def test_logs_of_episodes_are_read_as_beginning_at_rest(tmp_path, monkeypatch):
         explain(DRAWER, [first], [log, log], tmp_path / "gap", Console())
 
 
+def test_of_what_was_left_out_nothing_is_said_to_be_noise(tmp_path, monkeypatch):
+    log = Recording(0.01 * np.arange(100), {"qpos/joint1": np.zeros(100)}).save(tmp_path / "log.npz")
+    warnings = [Finding.warning(f"site/peg/{axis}", "start", "left out, as it hangs") for axis in "xz"]
+    warnings.append(Finding.warning("qpos/joint1", "units", "stands still"))
+    problem = SimpleNamespace(data=SimpleNamespace(warnings=warnings))
+    monkeypatch.setattr("simopt_envs.gap.find.read", lambda *_, **__: problem)
+    null = SimpleNamespace(held_out=SimpleNamespace(errors=np.ones((3, 4, 1))))
+    monkeypatch.setattr("simopt_envs.gap.find.refitted", lambda *_: null)
+    first = Gaussian.around_nominal(gym.make(DRAWER).unwrapped.parameters.subset(["joint_damping_2"]), std=0.1)
+    said = explain(DRAWER, [first], [log, log], tmp_path / "gap", Console())
+    assert said is not None
+    assert said.endswith("what is left is noise. site/peg/x, site/peg/z: left out, as it hangs.")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("mass", [0.0, 0.01])
 def test_a_knot_in_the_rope_is_told_by_the_peg_that_hangs_from_it(mass, few_effects):
@@ -347,7 +363,8 @@ def test_a_knot_in_the_rope_is_told_by_the_peg_that_hangs_from_it(mass, few_effe
     logs = [robot.log(trajectory) for trajectory in robot.rollout(Sway(), 6, np.random.default_rng(0))]
     space = EnvSimulator(SWING_PEG).parameters
     prior = inputs.distribution(SWING_PEG, space, ("joint_damping_2=0.05", "rope_bending_damping=0.1"))
-    assert explain(SWING_PEG, [prior], logs, Path("gap"), Console()) == (mass == 0.0)
+    explained = explain(SWING_PEG, [prior], logs, Path("gap"), Console())
+    assert (explained is not None) == (mass == 0.0)
     if mass:
         (found,) = json.loads(Path("gap/gap.json").read_text())["effects"]
         assert (found["effect"], found["where"]) == ("payload", "body:segment4")

@@ -34,7 +34,6 @@ _XI_PER_UPDATE = 200
 _FITS = ("cmaes", "least-squares")
 _GAP = "gap"
 _MOST_LOGS = 12  # the latest, that are looked at: the search takes its time
-_EXPLAINED = "Parameters within p(ξ) explain the measured rollouts: what is left is noise."
 
 
 @dataclass(frozen=True)
@@ -166,7 +165,7 @@ class Adapt:
         run, folder = Run.load(self.out), self.out / _GAP
         measured = [trajectory for k in range(len(run.iterations)) for trajectory in run.real(k)]
         logs = [log for log in map(robot.log, measured) if log.exists()][-_MOST_LOGS:]
-        finding, ways = _EXPLAINED, []
+        ways: list[str] = []
         if len(logs) < 2:
             finding = f"To see what p(ξ) cannot explain takes two logged rollouts at least, here {len(logs)}."
         else:
@@ -177,9 +176,9 @@ class Adapt:
             except ValueError as error:
                 finding = f"What p(ξ) cannot explain could not be looked for: {error}"
             else:
-                if not explained:
-                    finding = f"p(ξ) leaves more of the measured rollouts than noise; the gap workflow: {told(folder)}"
-                    ways = ways_on(self.system, folder)
+                more = "p(ξ) leaves more of the measured rollouts than noise; the gap workflow:"
+                finding = explained or f"{more} {told(folder)}"
+                ways = [] if explained else ways_on(self.system, folder)
         conclude(self.out, [finding], display)
         for line in ways:
             display.say(line)

@@ -26,6 +26,7 @@ from baselines.commands.recordings import existing_logs
 from simopt_envs.distributions import Gaussian
 from simopt_envs.engine import Engine, ThreadEngine
 from simopt_envs.measured import load_recording, load_recordings
+from simopt_envs.measured.recording import Finding
 from simopt_envs.physics import Parameter, ParameterSpace
 from simopt_envs.physics.spec_writer import write_spec
 
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 
 _HOME = "home"  # keyframe of an environment's model where its joints are when an episode begins
 _FITS = ".fits"
+_EXPLAINED = "Parameters within p(ξ) explain the measured rollouts: what is left is noise."
 
 
 @dataclass(frozen=True)
@@ -105,7 +107,7 @@ def explain(
     folder: Path,
     console: Console,
     engine: Engine | None = None,
-) -> bool:
+) -> str | None:
     """Find what an environment's model lacks, if p(ξ) leaves more of the logs of its episodes than noise.
 
     It does where the plain parameters, refitted under p(ξ), leave more in the median window held out: where fingers
@@ -122,7 +124,7 @@ def explain(
         engine: fits the candidates; threads of this process by default.
 
     Returns:
-        Whether noise is all that is left.
+        A sentence that noise is all that is left, and which columns could not be compared; None where more is left.
 
     Raises:
         ValueError: for logs that cannot be read as recordings of the environment.
@@ -132,7 +134,7 @@ def explain(
     from simopt_envs.gap.trial import of_median_window
 
     if (folder / "gap.json").exists() and not (folder / _FITS).exists():
-        return False
+        return None
     recordings = [replace(load_recording(log), at_rest=True) for log in logs]
     with _shown(console) as show:
         tried = []
@@ -142,12 +144,21 @@ def explain(
             null = refitted(problem, show)
             tried.append((of_median_window(null.held_out.errors), problem, null))
             if tried[-1][0] < EXPLAINED:
-                return True
+                return _EXPLAINED + _not_compared(problem.data.warnings)
         _, problem, null = min(tried, key=lambda one: one[0])
         gap = solve(problem, progress=show, engine=engine, directory=folder / _FITS, null=null)
     gap.save(folder)
     shutil.rmtree(folder / _FITS)
-    return False
+    return None
+
+
+def _not_compared(warnings: Sequence[Finding]) -> str:
+    """Of what nothing is said by that: windows and columns left out."""
+    channels: dict[str, list[str]] = {}
+    for warning in warnings:
+        if warning.check == "start":
+            channels.setdefault(warning.message, []).append(warning.channel)
+    return "".join(f" {', '.join(names)}: {message}." for message, names in channels.items())
 
 
 def told(folder: Path) -> str:
