@@ -153,7 +153,7 @@ def explain(
 
 
 def _not_compared(warnings: Sequence[Finding]) -> str:
-    """Of what nothing is said by that: windows and columns left out."""
+    """Windows and columns that were left out, of which nothing is known, as sentences."""
     channels: dict[str, list[str]] = {}
     for warning in warnings:
         if warning.check == "start":
