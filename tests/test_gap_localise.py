@@ -95,6 +95,18 @@ def test_errors_of_one_window_are_not_taken_for_many():
     assert np.mean(np.array(z) > 3) < 0.01
 
 
+def test_a_gap_in_one_of_three_recordings_does_not_hide_itself():
+    """What grows in one recording of three scatters as much as it is; a quarter more than noise in a window is none."""
+    rng, around = np.random.default_rng(4), sliding()
+    errors = rng.standard_normal((24, 26, 3))
+    errors[:8, :, 0] *= np.linspace(1, 60, 8)[:, None]
+    errors[:1, :, 1] *= 1.25
+    rows = {row.channel: row for row in rows_of(errors, around) if row.regime == EVERYWHERE}
+    assert rows["qpos/a"].z > 100
+    assert abs(rows["qpos/b"].z) < 3
+    assert abs(rows["qpos/c"].z) < 3
+
+
 def test_reversals_holds_and_steps():
     around = sliding(windows=1, samples=100)
     still = Circumstances(**{**vars(around), "velocity": np.where(around.time[..., None] < 0.5, 0.0, around.velocity)})

@@ -127,11 +127,12 @@ def tabulate(
 
 
 def _z(errors: Array, mask: Mask, counted: Mask) -> Array:
-    """Mean square of the errors in a regime above 1, in standard errors, (c,).
+    """Mean square of the errors in a regime above 1, in the standard errors that it has without a gap, (c,).
 
-    The standard error is that of the scatter over windows, since errors within one go together; where a few windows
-    scatter less than independent normal errors do, it is theirs. On top comes that of the noise which the errors were
-    whitened with: it was estimated from about as many samples as there are.
+    These are of the scatter over windows, since errors within one go together: at least what normal errors scatter that
+    are independent, as a few windows may scatter less by chance; at most what those do that are all the same within a
+    window, as more is of the gap itself, which would hide where it shows in one of a few recordings. On top comes that
+    of the noise which the errors were whitened with: it was estimated from about as many samples as there are.
     """
     count = mask.sum(axis=1)
     surplus = np.sum(errors**2 - 1.0, axis=1, where=mask)
@@ -139,7 +140,9 @@ def _z(errors: Array, mask: Mask, counted: Mask) -> Array:
     mean = surplus.sum(axis=0) / np.maximum(total, 1)
     windows = np.count_nonzero(count, axis=0)
     scatter = np.sum((surplus - mean * count) ** 2, axis=0) * windows / np.maximum(windows - 1, 1)
-    variance = np.maximum(scatter, _VARIANCE_OF_SQUARE * total) / np.maximum(total, 1) ** 2
+    together = np.sum(count**2, axis=0)
+    scatter = np.clip(scatter, _VARIANCE_OF_SQUARE * total, _VARIANCE_OF_SQUARE * together)
+    variance = scatter / np.maximum(total, 1) ** 2
     of_noise = _VARIANCE_OF_SQUARE / np.maximum(_NOISE_KNOWN_BY * counted.sum(axis=(0, 1)), 1)
     error = np.sqrt(variance + of_noise)
     return mean / np.where(error > 0, error, 1.0)
