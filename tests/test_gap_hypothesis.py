@@ -276,13 +276,14 @@ def _simulated(model):
     return data.qpos
 
 
-def test_what_is_only_seen_is_not_simulated_and_nothing_moves_otherwise():
-    spec = mujoco.MjSpec.from_string(_SCENERY.format(""))
+@pytest.mark.parametrize("settings", ["", '<compiler inertiafromgeom="true"/>'])
+def test_what_is_only_seen_is_not_simulated_and_nothing_moves_otherwise(settings):
+    spec = mujoco.MjSpec.from_string(_SCENERY.format(settings))
     plain = plain_parameters(spec)
-    lean = plain.compiled(spec)
+    lean = plain.compiled(plain.spec)
     assert [lean.geom(i).name for i in range(lean.ngeom)] == ["floor", "core"]
     np.testing.assert_array_equal(_simulated(lean), _simulated(spec.compile()))
-    assert spec.geom("shell") is not None  # the repaired model has it
+    assert plain.spec.geom("shell") is not None  # the repaired model has it
 
 
 def test_what_is_only_seen_stays_where_it_matters():

@@ -16,7 +16,7 @@ import simopt_envs  # noqa: F401 - registers the environments
 from simopt_envs.physics import ModelWriter, Parameter, ParameterSpace, Write
 from simopt_envs.physics.columns import acts_on_columns
 from simopt_envs.physics.effects import EFFECTS, Motion
-from simopt_envs.physics.spec_writer import write_spec
+from simopt_envs.physics.spec_writer import keep_inertias, write_spec
 from simopt_envs.physics.writer import field_elements, model_field
 
 pytestmark = needs_effects
@@ -216,11 +216,23 @@ def test_a_field_that_a_spec_cannot_hold_is_named_and_nothing_is_written():
     assert spec.joint("elbow").frictionloss == 0
 
 
-def test_a_compiler_that_overrides_what_was_written_is_noticed():
-    spec = mujoco.MjSpec.from_string(XML.replace('angle="radian"', 'angle="radian" inertiafromgeom="true"'))
+MASS = ParameterSpace([Parameter("m", "1", 1.0, 0.1, 9.0, "log", (Write("body_mass", "lower", operation="scale"),))])
+INERTIAL = '<body name="lower" pos=".3 0 0"><inertial pos="0 0 0" mass="7" diaginertia="1 1 1"/>'
+
+
+@pytest.mark.parametrize("compiler", ['inertiafromgeom="true"', 'inertiafromgeom="true" settotalmass="14"'])
+def test_a_compiler_that_infers_or_scales_all_masses_keeps_what_is_written(compiler):
+    """As those of most of Gymnasium's own models do; nothing else of the model changes."""
+    given = XML.replace('angle="radian"', f'angle="radian" {compiler}')
+    spec = mujoco.MjSpec.from_string(given.replace('<body name="lower" pos=".3 0 0">', INERTIAL))
     model = spec.compile()
-    space = ParameterSpace(
-        [Parameter("m", "1", 1.0, 0.1, 9.0, "log", (Write("body_mass", "lower", operation="scale"),))]
-    )
+    keep_inertias(spec)
+    np.testing.assert_array_equal(rollout(spec.compile()), rollout(model))
+    write_spec(spec, model, MASS, [2.0])
+    np.testing.assert_allclose(rollout(spec.compile()), rollout(written_model(model, MASS, [2.0])), atol=1e-9)
+
+
+def test_a_compiler_that_overrides_what_was_written_is_noticed():
+    spec = mujoco.MjSpec.from_string(XML.replace('angle="radian"', 'angle="radian" boundmass="0.3"'))
     with pytest.raises(ValueError, match="override what was written to body_mass"):
-        write_spec(spec, model, space, [2.0])
+        write_spec(spec, spec.compile(), MASS, [0.5])

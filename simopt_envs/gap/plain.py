@@ -15,6 +15,7 @@ from simopt_envs.physics.effects.actuators import actuators
 from simopt_envs.physics.effects.effect import object_name
 from simopt_envs.physics.effects.joints import is_slide, scalar_joints
 from simopt_envs.physics.parameters import Parameter, ParameterSpace, Write
+from simopt_envs.physics.spec_writer import keep_inertias
 from simopt_envs.physics.writer import ModelWriter
 
 _INERTIAL_STD = 0.10  # relative, of masses, inertias, armature and damping: what a data sheet or CAD is off by
@@ -49,7 +50,7 @@ class Plain:
     """The plain parameters of a model.
 
     Attributes:
-        spec, model: the model.
+        spec, model: the model, as a spec that keeps the masses that are written into it.
         prior: their distribution before the data.
     """
 
@@ -60,6 +61,8 @@ class Plain:
     @classmethod
     def of(cls, spec: mujoco.MjSpec, prior: Gaussian) -> Plain:
         """Parameters of a user's own, or the current p(ξ)."""
+        spec = spec.copy()
+        keep_inertias(spec)
         model = spec.compile()
         prior = _with_lead(model, prior)
         ModelWriter(model, ParameterSpace(p for p in prior.space if not acts_on_columns(p)))  # raises where it cannot
@@ -88,6 +91,7 @@ def plain_parameters(spec: mujoco.MjSpec) -> Plain:
     Link masses and inertias 10 %, armature and joint damping 10 %, servo gains 3 %, command latency 0-2 ms.
     """
     spec = spec.copy()
+    keep_inertias(spec)
     model = spec.compile()
     drives = [object_name(place) for place in actuators(model)]
     parameters, std = [], []

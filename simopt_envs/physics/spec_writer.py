@@ -45,7 +45,7 @@ def write_spec(spec: mujoco.MjSpec, model: mujoco.MjModel, space: ParameterSpace
 
     Raises:
         ValueError: if a parameter writes a field that a spec cannot hold; nothing has been written then. Also if the
-            spec's compiler does not keep what was written (``inertiafromgeom``), naming the field.
+            spec's compiler does not keep what was written (``boundmass``), naming the field.
     """
     writer = ModelWriter(model, space)
     for field in writer.fields:
@@ -69,6 +69,25 @@ def write_spec(spec: mujoco.MjSpec, model: mujoco.MjModel, space: ParameterSpace
         kept, meant = (model_field(m, field).ravel()[row] for m in (compiled, written))
         if not np.allclose(kept, meant, rtol=1e-9, atol=1e-12):
             raise ValueError(f"the compiler settings of the model override what was written to {field}")
+
+
+def keep_inertias(spec: mujoco.MjSpec) -> None:
+    """Let a spec keep the masses and inertias that are written into it, in place; it compiles to the same model.
+
+    A compiler that infers all of them from geoms (``inertiafromgeom="true"``, as in many of Gymnasium's models), or
+    scales them to a mass of all (``settotalmass``), overrides what is written.
+    """
+    compiler, kinds = spec.compiler, mujoco.mjtInertiaFromGeom
+    inferred, scaled = compiler.inertiafromgeom == kinds.mjINERTIAFROMGEOM_TRUE, compiler.settotalmass > 0
+    if not (inferred or scaled):
+        return
+    model = spec.compile()
+    for body in spec.bodies:
+        if body.explicitinertial or (scaled and model.body_mass[body.id]):
+            _set_inertial(body, model)
+    compiler.settotalmass = -1
+    if inferred:
+        compiler.inertiafromgeom = kinds.mjINERTIAFROMGEOM_AUTO
 
 
 _Writer = Callable[[mujoco.MjSpec, _Row], None]
@@ -113,7 +132,12 @@ def _range(spec: mujoco.MjSpec, row: _Row) -> None:
 
 def _inertial(spec: mujoco.MjSpec, row: _Row) -> None:
     """Writes mass, centre of mass and inertia of a body together: geoms no longer tell them."""
-    body, source = spec.body(row.object), row.model.body(row.object)
+    keep_inertias(spec)
+    _set_inertial(spec.body(row.object), row.model)
+
+
+def _set_inertial(body: Any, model: mujoco.MjModel) -> None:
+    source = model.body(body.id)
     body.explicitinertial = True
     body.mass = float(source.mass[0])
     body.ipos, body.iquat, body.inertia = source.ipos, source.iquat, source.inertia
