@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import difflib
+import os
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -51,6 +53,18 @@ def _write_delays(spec: mujoco.MjSpec, hypothesis: Hypothesis, xi: Array) -> Non
                 actuator.delay += max(float(delay), timestep)
                 actuator.nsample = max(actuator.nsample, int(np.ceil(actuator.delay / timestep)) + 1)
                 actuator.interp = max(actuator.interp, _LINEAR)
+
+
+def to_xml_in(spec: mujoco.MjSpec, folder: Path) -> str:
+    """MJCF of a spec to be saved in a folder: from there it finds meshes and textures where they are."""
+    files = (*spec.meshes, *spec.hfields, *spec.skins, *spec.textures)
+    if any(asset.file for asset in files):
+        spec = spec.copy()
+        for kind in ("meshdir", "texturedir"):
+            there = Path(spec.modelfiledir, getattr(spec.compiler, kind)).absolute()
+            setattr(spec.compiler, kind, os.path.relpath(there, folder.absolute()))
+        spec.modelfiledir = str(folder.absolute())
+    return str(spec.to_xml())
 
 
 def column_lines(hypothesis: Hypothesis, xi: Array) -> list[str]:

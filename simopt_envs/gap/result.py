@@ -17,7 +17,7 @@ from simopt_envs.gap.error import Errors
 from simopt_envs.gap.explanation import Explanation
 from simopt_envs.gap.hypothesis import Candidate
 from simopt_envs.gap.localise import Row
-from simopt_envs.gap.repair import column_lines, difference, repaired
+from simopt_envs.gap.repair import column_lines, difference, repaired, to_xml_in
 from simopt_envs.gap.thresholds import CONFIDENT, EXPLAINED, LEAST_SHARE
 from simopt_envs.gap.trial import Data, of_median_window
 from simopt_envs.measured.recording import Finding
@@ -181,7 +181,7 @@ class Gap:
         """
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "model.repaired.xml").write_text(self.spec.to_xml())
+        (folder / "model.repaired.xml").write_text(to_xml_in(self.spec, folder))
         (folder / "model.diff").write_text(self.diff)
         (folder / "gap.json").write_text(json.dumps(self.to_dict(), indent=1))
         for effect in self.effects:

@@ -1,0 +1,45 @@
+"""A repaired model as a file."""
+
+import matplotlib.image
+import mujoco
+import numpy as np
+import pytest
+from conftest import needs_effects
+
+from simopt_envs.gap.repair import to_xml_in
+
+pytestmark = needs_effects
+
+ROBOT = """
+<mujoco><compiler meshdir="meshes" texturedir="pictures"/>
+  <asset>
+    <mesh name="link" file="link.obj"/><texture name="paint" type="2d" file="paint.png"/>
+    <texture name="sky" type="skybox" builtin="flat" width="8" height="48"/><material name="paint" texture="paint"/>
+  </asset>
+  <worldbody><body><joint/><geom type="mesh" mesh="link" material="paint"/></body></worldbody>
+</mujoco>"""
+TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+
+
+@pytest.mark.parametrize("given_as", ["model.xml", "robot/model.xml"])
+def test_a_repaired_model_finds_its_meshes_and_textures_from_where_it_is_saved(tmp_path, monkeypatch, given_as):
+    robot, out = tmp_path / "robot", tmp_path / "out" / "gap"
+    for folder in (robot / "meshes", robot / "pictures", out):
+        folder.mkdir(parents=True)
+    (robot / "model.xml").write_text(ROBOT)
+    (robot / "meshes" / "link.obj").write_text(TETRAHEDRON)
+    matplotlib.image.imsave(robot / "pictures" / "paint.png", np.zeros((4, 4, 3)))
+    monkeypatch.chdir(robot if given_as == "model.xml" else tmp_path)
+    spec = mujoco.MjSpec.from_file(given_as)
+    mass = spec.compile().body_mass
+    (out / "model.repaired.xml").write_text(to_xml_in(spec, out))
+    monkeypatch.chdir("/")
+    saved = mujoco.MjModel.from_xml_path(str(out / "model.repaired.xml"))
+    np.testing.assert_allclose(saved.body_mass, mass)
+    assert (spec.compiler.meshdir, spec.compiler.texturedir) == ("meshes", "pictures")
+
+
+def test_a_repaired_model_without_files_tells_of_no_folder(tmp_path):
+    spec = mujoco.MjSpec.from_string("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
+    spec.compile()
+    assert to_xml_in(spec, tmp_path) == spec.to_xml()
