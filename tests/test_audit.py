@@ -268,6 +268,14 @@ def test_a_defect_is_named(what):
             audited(log, MODEL)
 
 
+def test_actuators_without_a_name_are_told():
+    """As in many of Gymnasium's models; a fit would fail later, in words that help nobody."""
+    spec = mujoco.MjSpec.from_string(ARM)
+    spec.actuators[0].name = ""
+    with pytest.raises(ValueError, match="the model's actuators 0 have no name, .* give them names in the MJCF"):
+        audited(GOOD, spec.compile())
+
+
 @pytest.mark.parametrize("what", ["nan", "clipped", "late velocity", "missing actuator", "degrees without a range"])
 def test_a_defect_of_one_channel_is_not_pinned_on_another(what):
     channel = {"missing actuator": "rail"}.get(what, "elbow")

@@ -40,6 +40,9 @@ def against_model(recording: Recording, model: mujoco.MjModel, broken: set[str])
         return
     for name in unknown:
         yield Finding.warning(name, "columns", "left out: " + unknown_name("column", name, known))
+    if nameless := [str(i) for i in range(model.nu) if not model.actuator(i).name]:
+        told = f"the model's actuators {', '.join(nameless)} have no name, so that no column ctrl/NAME can be theirs"
+        yield Finding.error("", "columns", f"{told}: give them names in the MJCF")
     for name in (c.name for c in known.values() if c.kind == "ctrl" and c.name not in recording.columns):
         yield Finding.error(
             name, "columns", f"the actuator has no command column; the log has {', '.join(recording.columns)}"
