@@ -272,7 +272,7 @@ def test_actuators_without_a_name_are_told():
     """As in many of Gymnasium's models; a fit would fail later, in words that help nobody."""
     spec = mujoco.MjSpec.from_string(ARM)
     spec.actuators[0].name = ""
-    with pytest.raises(ValueError, match="the model's actuators 0 have no name, .* give them names in the MJCF"):
+    with pytest.raises(ValueError, match=r"the model's actuators 0 have no name, .* give them names in the MJCF"):
         audited(GOOD, spec.compile())
 
 

@@ -10,7 +10,7 @@ import pytest
 from effect_arm import ARM, STEPS, TIMESTEP, structure, with_effect
 
 from simopt_envs.physics import ModelWriter, ParameterSpace
-from simopt_envs.physics.effects import EFFECTS, Motion
+from simopt_envs.physics.effects import EFFECTS, Effect, Motion
 from simopt_envs.physics.effects.actuators import driven_joint
 from simopt_envs.physics.spec_writer import write_spec
 
@@ -116,6 +116,23 @@ def test_probes_are_within_bounds_and_move_every_parameter(name: str) -> None:
     model, space = structure(name, place)
     probes = np.array([space.values(probe) for probe in EFFECTS[name].probes(model, place, MOTION)])
     assert (probes != space.nominal).any(axis=0).all()
+
+
+POINTER = """
+<mujoco><worldbody><body name="base"><joint name="turn"/><geom size="0.01" mass="0.001"/>
+  <body name="hand"><joint name="point"/><geom size="0.003" mass="0.00003"/></body>
+</body></worldbody>
+<actuator><motor name="turn" joint="turn"/><position name="point" joint="point" kp="1e-6"/></actuator></mujoco>
+"""
+
+
+@pytest.mark.parametrize("effect", EFFECTS.values(), ids=EFFECTS)
+def test_small_parts_can_have_every_effect(effect: Effect) -> None:
+    """Of 1e-10 kg m2: what an effect adds to a model must not be too light for the compiler."""
+    for place in effect.places(mujoco.MjModel.from_xml_string(POINTER)):
+        spec = mujoco.MjSpec.from_string(POINTER)
+        effect.add(spec, place)
+        spec.compile()
 
 
 def test_places() -> None:

@@ -15,7 +15,8 @@ from simopt_envs.physics.parameters import Array, Parameter, Write
 _DRUM = 1.0  # m: its radius; the law does not depend on it
 _RAIL = 100.0  # m: half the length of a slide's rail
 _SHOE = 0.01  # m: radius
-_WEIGHT = 1e-6  # of the shoes, in units of the joint's inertia: nothing
+_WEIGHT = 2e-6  # of the caliper, in units of the joint's inertia: nothing ...
+_LEAST = 1e-14  # kg: ... but more than what MuJoCo takes for none
 _CALIPER = 0.1  # its inertia, in the same units: lighter, it gives more to servos; heavier, fast motion throws it off
 _DAMPING = 30.0  # of its motion, in units of its inertia / dt: so that it does not rattle
 _STIFFNESS = 1.0  # of the contact, in units of 1/dt^2
@@ -60,6 +61,9 @@ class LoadDependentFriction(Effect):
         mujoco.mju_rotVecQuat(anchor, model.jnt_pos[model.joint(joint).id], model.body_quat[body])
         at = model.body_pos[body] + anchor
         caliper = link.parent.add_body(blank(), name=joint + BRAKE, pos=at, quat=model.body_quat[body])
+        weight = max(_WEIGHT * own, _LEAST)
+        caliper.explicitinertial, caliper.mass = True, weight
+        caliper.ipos, caliper.inertia = np.zeros(3), np.full(3, weight)
         caliper.add_joint(
             blank(),
             name=joint + BRAKE,
@@ -75,7 +79,7 @@ class LoadDependentFriction(Effect):
                 type=mujoco.mjtGeom.mjGEOM_SPHERE,
                 size=[_SHOE, 0.0, 0.0],
                 pos=end * (_DRUM + _SHOE) * press,
-                mass=_WEIGHT * own,
+                mass=0.0,
                 **_UNSEEN,
             )
             pair = spec.add_pair(blank(), name=name, geomname1=_drum(joint), geomname2=name, condim=3)
