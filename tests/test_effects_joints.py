@@ -142,6 +142,9 @@ def test_places() -> None:
     explicit = mujoco.MjModel.from_xml_string(ARM.replace("implicitfast", "RK4"))
     assert EFFECTS["joint_elasticity"].places(model) == ("joint:shoulder", "joint:elbow", "joint:drive")
     assert EFFECTS["joint_elasticity"].places(explicit) == ()
+    ways = "".join(f'<joint name="{i}" type="slide" axis="1 0 {i}"/>' for i in range(6))
+    loose = f'<mujoco><worldbody><body>{ways}<geom size="0.1"/></body></worldbody></mujoco>'
+    assert EFFECTS["backlash"].places(mujoco.MjModel.from_xml_string(loose)) == (), "a body has six joints at most"
 
 
 # Laws: the force that an effect adds at states, as the difference of two inverse dynamics.

@@ -18,6 +18,7 @@ _BEARING = ".bearing"  # what the name of the tendon ends in that has what resis
 _RESISTS = {f"dof_{quantity}": f"tendon_{quantity}" for quantity in ("damping", "dampingpoly", "frictionloss")}
 _TENDON = mujoco.mjtObj.mjOBJ_TENDON
 _SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+_MOST_DOFS = 6  # of a body, that MuJoCo takes
 
 
 def scalar_joints(model: mujoco.MjModel) -> tuple[str, ...]:
@@ -113,8 +114,12 @@ def inertia(spec: mujoco.MjSpec, joint: str) -> float:
 
 
 def outermost_joints(model: mujoco.MjModel) -> tuple[str, ...]:
-    """``"joint:NAME"`` of the hinges and slides that a coaxial joint can be put behind: the last of their bodies."""
-    last = {int(adr + num) - 1 for adr, num in zip(model.body_jntadr, model.body_jntnum, strict=True) if num}
+    """``"joint:NAME"`` of the hinges and slides that a coaxial joint can be put behind: the last of their bodies.
+
+    A body that its joints move in six ways, as a loose object, can have no more.
+    """
+    joints = zip(model.body_jntadr, model.body_jntnum, model.body_dofnum, strict=True)
+    last = {int(adr + num) - 1 for adr, num, dofs in joints if 0 < dofs < _MOST_DOFS}
     return tuple(place for place in scalar_joints(model) if model.joint(object_name(place)).id in last)
 
 
