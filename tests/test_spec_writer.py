@@ -220,6 +220,7 @@ MASS = ParameterSpace([Parameter("m", "1", 1.0, 0.1, 9.0, "log", (Write("body_ma
 INERTIAL = '<body name="lower" pos=".3 0 0"><inertial pos="0 0 0" mass="7" diaginertia="1 1 1"/>'
 
 
+@pytest.mark.filterwarnings("ignore:compiler attribute .settotalmass")
 @pytest.mark.parametrize("compiler", ['inertiafromgeom="true"', 'inertiafromgeom="true" settotalmass="14"'])
 def test_a_compiler_that_infers_or_scales_all_masses_keeps_what_is_written(compiler):
     """As those of most of Gymnasium's own models do; nothing else of the model changes."""

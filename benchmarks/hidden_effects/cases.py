@@ -18,7 +18,7 @@ from benchmarks.hidden_effects.plants import plants
 
 Kind = Literal["single", "null", "outside", "double"]
 KINDS: tuple[Kind, ...] = ("single", "null", "outside", "double")
-FIRST_SEED = {"dev": 0, "test": 37000}
+FIRST_SEED = {"dev": 0, "test": 38000}
 """Split -> its first seed. Seeds from 1000, 2000, ... 36000 on were earlier test splits, so they count as seen; with
 which commit each was run is in ``docs/hidden_effects.md``.
 """

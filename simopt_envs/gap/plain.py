@@ -90,9 +90,7 @@ def plain_parameters(spec: mujoco.MjSpec) -> Plain:
 
     Link masses and inertias 10 %, armature and joint damping 10 %, servo gains 3 %, command latency 0-2 ms.
     """
-    spec = spec.copy()
-    keep_inertias(spec)
-    model = spec.compile()
+    model = spec.copy().compile()
     drives = [object_name(place) for place in actuators(model)]
     parameters, std = [], []
     for body in _moving_bodies(model):
@@ -127,7 +125,7 @@ def plain_parameters(spec: mujoco.MjSpec) -> Plain:
     mean = space.to_unconstrained(space.nominal)
     if "command_latency" in space:
         mean[space.index("command_latency")] = _LATENCY_MEAN
-    return Plain(spec, model, _with_lead(model, Gaussian(space, mean, np.diag(np.square(std)))))
+    return Plain.of(spec, Gaussian(space, mean, np.diag(np.square(std))))
 
 
 def _with_lead(model: mujoco.MjModel, prior: Gaussian) -> Gaussian:

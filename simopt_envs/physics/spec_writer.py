@@ -137,6 +137,7 @@ def _inertial(spec: mujoco.MjSpec, row: _Row) -> None:
 
 
 def _set_inertial(body: Any, model: mujoco.MjModel) -> None:
+    """Gives a body of a compiled spec the inertial that a model of it has there."""
     source = model.body(body.id)
     body.explicitinertial = True
     body.mass = float(source.mass[0])
