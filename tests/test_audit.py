@@ -269,10 +269,11 @@ def test_a_defect_is_named(what):
 
 
 def test_actuators_without_a_name_are_told():
-    """As in many of Gymnasium's models; a fit would fail later, in words that help nobody."""
+    """Where they share what they act on; a fit would fail later, in words that help nobody."""
     spec = mujoco.MjSpec.from_string(ARM)
     spec.actuators[0].name = ""
-    with pytest.raises(ValueError, match=r"the model's actuators 0 have no name, .* give them names in the MJCF"):
+    spec.add_actuator(target=spec.actuators[0].target, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    with pytest.raises(ValueError, match=r"the model's actuators 0, 3 have no name, .* give them names in the MJCF"):
         audited(GOOD, spec.compile())
 
 

@@ -8,6 +8,7 @@ import pytest
 from conftest import needs_effects
 
 from simopt_envs.gap.carriers import Carrier, Residual
+from simopt_envs.gap.circumstances import circumstances
 from simopt_envs.gap.curves import Variable
 from simopt_envs.gap.describe import describe, describe_errors
 from simopt_envs.gap.fit import Misfit
@@ -132,6 +133,20 @@ def test_describes_a_simulated_force():
     assert found.curve.r2 > 0.8
     truth = 0.5 * found.curve.x**2  # some of it the plain parameters take up
     assert np.sqrt(np.mean((found.curve.y - truth) ** 2)) < 0.3 * np.sqrt(np.mean(truth**2))
+
+
+def test_where_no_variable_describes_it_the_regime_is_told_in_which_most_is_left():
+    """Errors without any law, but six times as large while the carriage moves fast."""
+    rng = np.random.default_rng(3)
+    hypothesis, u, residual = slider_residual(lambda q: 0.0, rng)
+    fast = np.abs(circumstances(hypothesis.plain.model, residual.windows).velocity)
+    errors = rng.standard_normal(residual.errors.shape) * np.where(fast > np.median(fast), 6.0, 1.0)
+    found = describe(hypothesis, u, [replace(residual, errors=errors)])
+    assert found.curve is None
+    assert "Most is left of qpos/slide with the speed of slide high: there its mean square is 1.9 times" in found.text
+    even = describe(hypothesis, u, [replace(residual, errors=6 * rng.standard_normal(residual.errors.shape))])
+    assert even.text.startswith("No one variable describes it")
+    assert "Most is left" not in even.text
 
 
 def test_has_nothing_to_describe_where_noise_alone_is_left():

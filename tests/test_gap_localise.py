@@ -35,6 +35,7 @@ def sliding(windows=24, samples=26, period=0.02):
         load=np.cos(3 * phase)[..., None],
         command=command[..., None],
         contact=np.zeros(time.shape, dtype=bool),
+        stopped=np.abs(np.sin(phase))[..., None] > 0.99,
         time=time,
         period=period,
     )
@@ -116,6 +117,27 @@ def test_reversals_holds_and_steps():
     turns = np.flatnonzero(np.diff(around.direction()[0, :, 0]))
     assert turns * around.period == pytest.approx([0.25, 0.75, 1.25, 1.75], abs=0.03)
     assert np.flatnonzero(around.stepped()[0]).tolist() == [13]
+
+
+def test_what_a_stop_does_is_told_by_its_regime():
+    """A joint that touches both ends of its range in every second, of which the model knows little."""
+    around = sliding()
+    errors = np.random.default_rng(5).standard_normal((24, 26, 3))
+    errors[..., 1] *= np.where(around.stopped[..., 0], 6.0, 1.0)
+    rows = rows_of(errors, around)
+    most = max((row for row in rows if row.regime != EVERYWHERE and row.lift > 1), key=lambda row: row.telling)
+    assert (most.channel, most.regime) == ("qpos/b", "stop of slide: just reached")
+
+
+@pytest.mark.parametrize(("limited", "at"), [("true", [0, 3, 4]), ("false", [])])
+def test_joints_at_an_end_of_their_range(limited, at):
+    xml = SLIDER.replace('axis="1 0 0"', f'axis="1 0 0" limited="{limited}" range="-1 0.5"')
+    time = 0.02 * np.arange(31)
+    position = np.interp(time, [0, 0.15, 0.3, 0.45, 0.6], [-1, -0.9, 0, 0.498, 0.51])
+    model = mujoco.MjModel.from_xml_string(xml)
+    windows = cut_windows(model, Recording(time, {"ctrl/drive": 0 * time, "qpos/slide": position}, "run"), 0.6)
+    around = circumstances(model, windows)
+    assert np.isin([0, 8, 15, 23, 30], np.flatnonzero(around.stopped[0, :, 0])).nonzero()[0].tolist() == at
 
 
 def test_follows_measured_joints_and_simulates_the_others():

@@ -337,8 +337,11 @@ def test_what_cannot_be_replayed_is_refused():
     recording, *_ = record(model, 300)
     with pytest.raises(ValueError, match="no command column for the actuators servo; it has ctrl/push"):
         cut_windows(model, without(recording, "ctrl/servo"))
-    with pytest.raises(ValueError, match=r"the model's actuators 1 have no name; .* give them names in the MJCF"):
-        cut_windows(mujoco.MjModel.from_xml_string(CART.format(armature="").replace('name="servo"', "")), recording)
+    nameless = CART.format(armature="").replace(
+        "</actuator>", '<motor joint="hinge"/><motor joint="hinge"/></actuator>'
+    )
+    with pytest.raises(ValueError, match=r"the model's actuators 2, 3 have no name; .* give them names in the MJCF"):
+        cut_windows(mujoco.MjModel.from_xml_string(nameless), recording)
     with pytest.raises(ValueError, match="no column of recording names anything in the model"):
         cut_windows(model, recording.only(["ctrl/push", "ctrl/servo"]))
     with pytest.raises(ValueError, match=r"no whole window of 5 s .* the longest lasts 0\.598 s"):

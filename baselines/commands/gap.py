@@ -43,7 +43,7 @@ class Gap:
     """Find where a model and recordings disagree, name the missing physical effect, and write the model with it."""
 
     model: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MODEL.xml|ENV_ID")]
-    """MJCF file, or id of an environment of this package."""
+    """MJCF file, or id of an environment: of this package, or one that runs an MJCF file, as Gymnasium's."""
     data: tuple[Path, ...]
     """Recordings; half of them are held out."""
     out: Path
@@ -53,9 +53,10 @@ class Gap:
     """YAML file that names the columns of foreign logs."""
     config: Path | None = None
     """YAML file of plain parameters and their priors; by default masses, inertias, armature, damping, gains, latency;
-    of an environment the first p(ξ) of adapt."""
+    of an environment of this package the first p(ξ) of adapt."""
     keyframe: str | None = None
-    """Where joints start that no column tells of; by default the model's reference, of an environment its home."""
+    """Where joints start that no column tells of; by default the model's reference, of an environment of this package
+    its home."""
     at_rest: tuple[Path, ...] = ()
     """Those of the recordings that begin with everything at rest, joints that no column tells of at that keyframe: a
     rope hangs, a drawer is shut. If they are most, they alone are compared, from there to their ends."""
@@ -80,8 +81,8 @@ class Gap:
         model: str | mujoco.MjSpec = self.model
         keyframe, plain = self.keyframe, None
         if self.model in gym.registry:
-            model, plain = environment(self.model)
-            keyframe = keyframe or _HOME
+            model, plain = _model_of(self.model)
+            keyframe = keyframe or (None if plain is None else _HOME)
         if self.config is not None:
             plain = read_parameters(self.config)
         engine, console = self.where.make(local=ThreadEngine), Console(highlight=False)
@@ -187,6 +188,18 @@ def ways_on(env_id: str, folder: Path) -> list[str]:
             read = f'json.load(open("{folder / "gap.json"}"))["effects"]'
             lines.append(f'repaired environment: gym.make("{env_id}", effects={read})')
     return lines
+
+
+def _model_of(env_id: str) -> tuple[mujoco.MjSpec, Gaussian | None]:
+    """The model of any environment; with it, of one of this package, the first p(ξ) of adapt.
+
+    Raises:
+        ValueError: where it runs no MJCF file that can be told.
+    """
+    env: Any = gym.make(env_id).unwrapped
+    env.close()
+    file = getattr(env, "fullpath", None)  # Gymnasium's name for it, and gymnasium-robotics'
+    return environment(env_id) if file is None else (mujoco.MjSpec.from_file(file), None)
 
 
 def environment(env_id: str, current: Gaussian | None = None) -> tuple[mujoco.MjSpec, Gaussian]:

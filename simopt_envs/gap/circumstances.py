@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import mujoco
@@ -22,6 +23,7 @@ Mask = NDArray[np.bool_]
 _HELD = 0.05  # of a joint's root-mean-square speed: below it for this long, the joint is held
 _HELD_FOR = 0.1  # s
 _STEP = 0.1  # of a command's range: what it jumps by in one sample to count as a step
+_AT_A_STOP = 0.005  # of a joint's range: so near to an end, it is there
 _FEW_SAMPLES = 5  # that a local polynomial needs
 
 
@@ -37,6 +39,7 @@ class Circumstances:
             (w, S, j).
         command: (w, S, u).
         contact: whether anything touches, (w, S).
+        stopped: whether each joint is at an end of its range, (w, S, j).
         time: since the first window of the recording [s], (w, S).
         period: seconds between samples.
     """
@@ -49,6 +52,7 @@ class Circumstances:
     load: Array
     command: Array
     contact: Mask
+    stopped: Mask
     time: Array
     period: float
 
@@ -118,6 +122,7 @@ def circumstances(model: mujoco.MjModel, windows: Windows) -> Circumstances:
         load=load[..., dofs],
         command=command,
         contact=contact,
+        stopped=_at_its_stops(model, joints, qpos[..., coordinates]),
         time=since[:, None] + windows.offsets,
         period=period,
     )
@@ -150,6 +155,14 @@ def _forces(model: mujoco.MjModel, qpos: Array, qvel: Array, command: Array) -> 
         if not driven.all():
             load[at] = np.where(driven, data.qfrc_actuator, data.qfrc_bias)
     return load, contact
+
+
+def _at_its_stops(model: mujoco.MjModel, joints: Sequence[str], position: Array) -> Mask:
+    """Whether joints at some positions (w, S, j) are at an end of their ranges."""
+    ids = [model.joint(joint).id for joint in joints]
+    low, high = model.jnt_range[ids].T
+    near = _AT_A_STOP * (high - low)
+    return (model.jnt_limited[ids] != 0) & ((position < low + near) | (position > high - near))
 
 
 def _rms(values: Array) -> Array:

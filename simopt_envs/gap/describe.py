@@ -10,7 +10,7 @@ they take away there.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
@@ -19,6 +19,7 @@ from simopt_envs.gap.carriers import Carrier, Residual, forces, readings
 from simopt_envs.gap.circumstances import Circumstances, circumstances
 from simopt_envs.gap.curves import Curve, Regression, Variable, regress
 from simopt_envs.gap.hypothesis import Hypothesis
+from simopt_envs.gap.localise import EVERYWHERE, Row, partitions, tabulate
 from simopt_envs.physics.effects.joints import force_unit, is_slide
 from simopt_envs.physics.parameters import Array
 
@@ -26,6 +27,7 @@ _LEAST_R2 = 0.25  # below it a variable does not describe the misfit
 _SIMPLER = 0.03  # of what the best explains, that a simpler description or one of the joint's own motion may lack
 _NEARLY = 0.1  # of what the best variable explains, that another may lack to do nearly as well
 _NOT = 0.2  # of what the best variable explains: one that explains less does not matter
+_CLEARLY = 1.5  # times its mean square that a channel has where a sentence says most is left
 _LEAST_EXCESS = 3.0  # standard errors of the squared errors over those of noise, for there to be something to describe
 _CONSTANT = "a constant"
 _NEAR_ZERO = 0.06  # of a variable's range
@@ -56,7 +58,7 @@ def describe(hypothesis: Hypothesis, u: Array, residuals: Sequence[Residual]) ->
     Args:
         hypothesis: plain parameters and effects.
         u: their fitted coordinates, (d,).
-        residuals: what it leaves, of two recordings or more.
+        residuals: what it leaves, of two recordings or more; those held out last.
     """
     around = [circumstances(hypothesis.plain.model, r.windows) for r in residuals]
     carriers = [*forces(hypothesis, u, residuals), *readings(residuals)]
@@ -67,7 +69,12 @@ def describe(hypothesis: Hypothesis, u: Array, residuals: Sequence[Residual]) ->
     excess = sum(float(np.sum(r.errors**2)) for r in residuals) - samples
     if excess < _LEAST_EXCESS * np.sqrt(2 * samples):
         return Description("No more is left than noise.", None, ())
-    return describe_errors(carriers, variables(hypothesis.plain.model, around), recordings, excess)
+    found = describe_errors(carriers, variables(hypothesis.plain.model, around), recordings, excess)
+    if found.curve is not None:
+        return found
+    last = residuals[-1].windows
+    rows = tabulate(last.names, residuals[-1].errors, np.isfinite(last.measured), partitions(around[-1]))
+    return replace(found, text=found.text + _where(rows))
 
 
 def describe_errors(
@@ -129,6 +136,19 @@ def variables(model: mujoco.MjModel, around: Sequence[Circumstances]) -> list[Va
     for a, actuator in enumerate(first.actuators):
         found.append(Variable(f"command of {actuator}", "", actuator, 2, tuple(c.command[..., a] for c in around)))
     return [v for v in found if any(np.ptp(values) > 0 for values in v.values)]
+
+
+def _where(rows: Sequence[Row]) -> str:
+    """A sentence on the regime in which most is left, if that is clearly more than elsewhere."""
+    regimes = [row for row in rows if row.regime != EVERYWHERE and row.lift > _CLEARLY]
+    row = max(regimes, key=lambda row: row.telling, default=None)
+    if row is None or not row.telling:
+        return ""
+    partition, part = row.regime.split(": ")
+    return (
+        f" Most is left of {row.channel} with the {partition} {part}: there its mean square is {row.lift:.1f} times"
+        f" that of all its samples, {row.z:.0f} standard errors above noise."
+    )
 
 
 def _sentence(regression: Regression, curve: Curve, others: Mapping[Regression, float]) -> str:

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 from scipy.signal import sawtooth, square
 
+from simopt_envs.measured.channels import actuator_names
 from simopt_envs.measured.recording import Recording
 from simopt_envs.physics.parameters import Array
 
@@ -53,7 +54,7 @@ def excitations(model: mujoco.MjModel, recordings: Sequence[Recording], period: 
     poses. They begin with the first recording's first command, keep within the range of all that was commanded and the
     model's ``ctrlrange``, and change by little more than commands ever did. None where no command ever moved.
     """
-    names = [f"ctrl/{model.actuator(i).name}" for i in range(model.nu)]
+    names = [f"ctrl/{name}" for name in actuator_names(model)]
     low, high = np.array([_range(model, i, recordings, name) for i, name in enumerate(names)]).reshape(-1, 2).T
     if np.all(low == high):
         return

@@ -17,13 +17,12 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import StrMethodFormatter
 
 from simopt_envs.gap.curves import Curve
-from simopt_envs.gap.localise import EVERYWHERE, Row
+from simopt_envs.gap.localise import EVERYWHERE, SIGNIFICANT, Row
 from simopt_envs.measured.windows import Windows
 from simopt_envs.physics.parameters import Array
 from simopt_envs.report.figures import BLUE, GREEN, GREY, INK, ORANGE, styled
 
 _WIDTH = 10.0  # inches
-_SIGNIFICANT = 3.0  # standard errors from which a cell of the map counts
 _MOST_PARTITIONS = 12
 _MOST_CHANNELS = 6
 _MOVING = 3.0  # standard deviations of its noise from which a channel shows motion
@@ -43,7 +42,7 @@ def regime_figure(rows: Sequence[Row]) -> Figure:
     regimes = _telling_regimes(rows)
     figure = Figure(figsize=(_WIDTH, 2.6 + 0.32 * len(whole)), layout="constrained")
     bars, *cells = figure.subplots(1, 2 if regimes else 1, width_ratios=(1, 4)[: 2 if regimes else 1], squeeze=False)[0]
-    strong = [BLUE if row.z > _SIGNIFICANT else "#C5C9CF" for row in whole]
+    strong = [BLUE if row.z > SIGNIFICANT else "#C5C9CF" for row in whole]
     bars.barh(range(len(whole)), [100 * row.share for row in whole], color=strong)
     bars.set_yticks(range(len(whole)), [row.channel for row in whole])
     bars.set(title="Share of the misfit [%]", xlim=(0, None), ylim=(len(whole) - 0.5, -0.5))
@@ -57,7 +56,7 @@ def _draw_cells(figure: Figure, axis: Axes, rows: Sequence[Row], channels: list[
     """The lift of each channel in each regime, where there is more than noise."""
     lift = np.full((len(channels), len(regimes)), np.nan)
     for row in rows:
-        if row.regime in regimes and row.z > _SIGNIFICANT:
+        if row.regime in regimes and row.z > SIGNIFICANT:
             lift[channels.index(row.channel), regimes.index(row.regime)] = row.lift
     image = axis.imshow(lift, cmap="PuOr_r", norm=LogNorm(1 / 3, 3), aspect="auto")
     for (i, j), value in np.ndenumerate(lift):
@@ -231,15 +230,14 @@ def _telling_regimes(rows: Sequence[Row]) -> list[str]:
         parts.setdefault(partition, [])
         if row.regime not in parts[partition]:
             parts[partition].append(row.regime)
-        telling = row.share * abs(np.log(max(row.lift, 1e-3))) if row.z > _SIGNIFICANT else 0.0
-        strength[partition] = max(strength.get(partition, 0.0), telling)
+        strength[partition] = max(strength.get(partition, 0.0), row.telling)
     best = sorted(strength, key=lambda partition: -strength[partition])[:_MOST_PARTITIONS]
     return [regime for partition in best for regime in sorted(parts[partition], key=_natural)]
 
 
 def _natural(regime: str) -> int:
     """Low before middle before high."""
-    order = ("hold", "free", "smooth", "steady", "early", "low", "middle", "high", "late")
+    order = ("hold", "free", "smooth", "steady", "away", "early", "low", "middle", "high", "late")
     name = regime.split(": ")[1]
     return order.index(name) if name in order else len(order)
 

@@ -30,6 +30,7 @@ from simopt_envs.gap.sizes import of_best_length
 from simopt_envs.gap.thresholds import LARGE
 from simopt_envs.gap.trial import Base, Data
 from simopt_envs.gap.wild_starts import of_linear_starts, without_wild_columns, without_wild_starts
+from simopt_envs.measured.channels import actuator_names
 from simopt_envs.measured.mapping import LogMapping
 from simopt_envs.measured.readers import load_recordings
 from simopt_envs.measured.recording import Recording
@@ -208,11 +209,17 @@ def _left_by(base: Base, windows: Windows) -> Residual:
 
 
 def _spec(model: str | Path | mujoco.MjSpec) -> mujoco.MjSpec:
+    """The model, its actuators called as in recordings."""
     if isinstance(model, mujoco.MjSpec):
-        return model
-    if not Path(model).exists():
+        spec = model.copy()
+    elif Path(model).exists():
+        spec = mujoco.MjSpec.from_file(str(model))
+    else:
         raise FileNotFoundError(f"there is no model {model}")
-    return mujoco.MjSpec.from_file(str(model))
+    names = actuator_names(spec.compile())
+    for actuator in spec.actuators:
+        actuator.name = names[actuator.id]
+    return spec
 
 
 def _places(effect: Effect, model: mujoco.MjModel) -> list[Candidate]:

@@ -17,6 +17,8 @@ from simopt_envs.physics.parameters import Array
 
 EVERYWHERE = "all"
 """The regime of a channel as a whole."""
+SIGNIFICANT = 3.0
+"""Standard errors from which a regime counts."""
 
 _AFTER = 0.1  # s after a reversal or a command's step that count as its regime
 _FEWEST_WINDOWS = 4  # that a regime is in, to say anything of it
@@ -42,6 +44,11 @@ class Row:
     share: float
     lift: float
     z: float
+
+    @property
+    def telling(self) -> float:
+        """How much it matters that the misfit is larger, or smaller, here than elsewhere; 0 for what may be chance."""
+        return self.share * abs(np.log(max(self.lift, 1e-3))) if self.z > SIGNIFICANT else 0.0
 
 
 @dataclass(frozen=True)
@@ -88,6 +95,8 @@ def partitions(of: Circumstances) -> Iterator[Partition]:
         yield Partition(f"position of {joint}", _thirds(of.position[..., j], ("low", "middle", "high")))
         heavy = load > np.median(load)
         yield Partition(f"load on {joint}", {"low": ~heavy, "high": heavy})
+        stopped = _soon_after(of.stopped[..., j : j + 1], after)[..., 0]
+        yield Partition(f"stop of {joint}", {"just reached": stopped, "away": ~stopped})
     yield Partition("contact", {"touching": of.contact, "free": ~of.contact})
     stepped = _soon_after(of.stepped()[..., None], after)[..., 0]
     yield Partition("command", {"just stepped": stepped, "smooth": ~stepped})

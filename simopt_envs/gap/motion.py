@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
+from simopt_envs.measured.channels import actuator_names
 from simopt_envs.measured.engines import settle_actuators
 from simopt_envs.measured.recording import Recording
 from simopt_envs.measured.states import estimate_states
@@ -30,7 +31,7 @@ def motion_of(model: mujoco.MjModel, recordings: Sequence[Recording], keyframe: 
         states = estimate_states(model, grid, samples, keyframe)
         qpos.append(states.qpos)
         qvel.append(states.qvel)
-        commands = [grid[f"ctrl/{model.actuator(i).name}"][samples] for i in range(model.nu)]
+        commands = [grid[f"ctrl/{name}"][samples] for name in actuator_names(model)]
         ctrl.append(np.stack(commands, axis=-1) if commands else np.empty((len(samples), 0)))
     positions, velocities, controls = map(np.concatenate, (qpos, qvel, ctrl))
     data = mujoco.MjData(model)

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from scipy import signal
 
-from simopt_envs.measured.channels import Channel, model_channels
+from simopt_envs.measured.channels import Channel, actuator_names, model_channels
 from simopt_envs.measured.recording import Finding, Recording
 from simopt_envs.measured.resample import Array
 from simopt_envs.measured.smoothing import Smoothed, smooth
@@ -40,7 +40,7 @@ def against_model(recording: Recording, model: mujoco.MjModel, broken: set[str])
         return
     for name in unknown:
         yield Finding.warning(name, "columns", "left out: " + unknown_name("column", name, known))
-    if nameless := [str(i) for i in range(model.nu) if not model.actuator(i).name]:
+    if nameless := [str(i) for i, name in enumerate(actuator_names(model)) if not name]:
         told = f"the model's actuators {', '.join(nameless)} have no name, so that no column ctrl/NAME can be theirs"
         yield Finding.error("", "columns", f"{told}: give them names in the MJCF")
     for name in (c.name for c in known.values() if c.kind == "ctrl" and c.name not in recording.columns):
@@ -182,7 +182,7 @@ def _commands(grid: Recording, model: mujoco.MjModel, joints: dict[int, Smoothed
     def slow(values: Array) -> Array:
         return signal.sosfiltfilt(low_pass, values, axis=0)[edge:-edge:stride]
 
-    period = stride * grid.period
+    period, commands = stride * grid.period, [f"ctrl/{name}" for name in actuator_names(model)]
     for dof in range(model.nv):
         joint = int(model.dof_jntid[dof])
         velocity = joints[joint].velocity
@@ -191,20 +191,19 @@ def _commands(grid: Recording, model: mujoco.MjModel, joints: dict[int, Smoothed
         want = slow(needed[:, dof])
         spread = given[:, dof].std(axis=0)
         for actuator in np.flatnonzero(spread > 0.5 * spread.max()):  # others would be drowned
-            name = f"ctrl/{model.actuator(int(actuator)).name}"
+            name = commands[int(actuator)]
             have = slow(given[:, dof, actuator])
             still = _partial_correlation(want, have, nuisance)
             correlation, lag = _best_lag(want, have, period, nuisance)
             yield from _command(name, model.joint(joint).name, want, have, (still, correlation, lag, grid.period))
             for other in set(range(model.nu)) - {int(actuator)} if still < COMMAND_ALIKE else ():
-                foreign = slow(grid[f"ctrl/{model.actuator(other).name}"])
+                foreign = slow(grid[commands[other]])
                 alike = _partial_correlation(want, foreign, nuisance)
                 if alike > COMMAND_ALIKE and (1 - still**2) > COMMAND_CLEARER * (1 - alike**2):
                     yield Finding.warning(
                         name,
                         "command",
-                        f"{model.joint(joint).name} moves with ctrl/{model.actuator(other).name} instead: are columns"
-                        " swapped?",
+                        f"{model.joint(joint).name} moves with {commands[other]} instead: are columns swapped?",
                     )
 
 
@@ -236,7 +235,7 @@ def _torques(grid: Recording, model: mujoco.MjModel, joints: dict[int, Smoothed]
     data = mujoco.MjData(model)
     order = [joints[int(model.dof_jntid[dof])] for dof in range(model.nv)]
     state = [np.stack([getattr(s, what) for s in order], axis=1) for what in ("value", "velocity", "acceleration")]
-    commands = np.stack([grid[f"ctrl/{model.actuator(i).name}"] for i in range(model.nu)], axis=1)
+    commands = np.stack([grid[f"ctrl/{name}"] for name in actuator_names(model)], axis=1)
     needed, given = np.full((len(grid), model.nv), np.nan), np.zeros((len(grid), model.nv, model.nu))
     moments = np.zeros((model.nu, model.nv))
     for t in np.flatnonzero(np.isfinite(np.concatenate(state, axis=1)).all(axis=1)):

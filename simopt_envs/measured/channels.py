@@ -44,8 +44,34 @@ _SENSOR_UNITS = {
 }
 
 
+_DRIVEN = {
+    mujoco.mjtTrn.mjTRN_JOINT: mujoco.mjtObj.mjOBJ_JOINT,
+    mujoco.mjtTrn.mjTRN_JOINTINPARENT: mujoco.mjtObj.mjOBJ_JOINT,
+    mujoco.mjtTrn.mjTRN_TENDON: mujoco.mjtObj.mjOBJ_TENDON,
+    mujoco.mjtTrn.mjTRN_SITE: mujoco.mjtObj.mjOBJ_SITE,
+    mujoco.mjtTrn.mjTRN_SLIDERCRANK: mujoco.mjtObj.mjOBJ_SITE,
+    mujoco.mjtTrn.mjTRN_BODY: mujoco.mjtObj.mjOBJ_BODY,
+}
+
+
+def actuator_names(model: mujoco.MjModel) -> list[str]:
+    """What each actuator's command is called in recordings.
+
+    One without a name, as most of Gymnasium's, has that of what it acts on, where no other actuator has it; else "".
+    """
+    given = [model.actuator(i).name for i in range(model.nu)]
+    acts_on = [
+        mujoco.mj_id2name(model, _DRIVEN[mujoco.mjtTrn(model.actuator_trntype[i])], model.actuator_trnid[i, 0]) or ""
+        for i in range(model.nu)
+    ]
+    nameless = [target for name, target in zip(given, acts_on, strict=True) if not name]
+    taken = {*given, *(target for target in nameless if nameless.count(target) > 1)}
+    return [name or ("" if target in taken else target) for name, target in zip(given, acts_on, strict=True)]
+
+
 def model_channels(model: mujoco.MjModel) -> dict[str, Channel]:
-    """Every column a recording of this model can have, by name; unnamed objects have none.
+    """Every column a recording of this model can have, by name; unnamed objects have none, but see
+    :func:`actuator_names`.
 
     Where a joint has several numbers (ball, free) they are ``/0``, ``/1`` ..., as for sensors.
     """
@@ -56,8 +82,8 @@ def model_channels(model: mujoco.MjModel) -> dict[str, Channel]:
             name = prefix if count == 1 else f"{prefix}/{k}"
             channels.append(Channel(name, kind, start + k, object_id, units[min(k, len(units) - 1)]))
 
-    for i in range(model.nu):
-        if name := model.actuator(i).name:
+    for i, name in enumerate(actuator_names(model)):
+        if name:
             add(f"ctrl/{name}", "ctrl", i, i, 1, ("",))
     for i in range(model.njnt):
         if name := model.joint(i).name:

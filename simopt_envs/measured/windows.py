@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from simopt_envs.measured.channels import Channel, model_channels
+from simopt_envs.measured.channels import Channel, actuator_names, model_channels
 from simopt_envs.measured.engines import BatchEngine, RolloutEngine, field_sizes
 from simopt_envs.measured.recording import Recording
 from simopt_envs.measured.resample import GAP_PERIODS, Array, hold, longest_interval
@@ -232,7 +232,7 @@ def _commands(
 ) -> Array:
     """Commands (w, past + future, nu) on the model's timestep around each start."""
     at = starts[:, None] + timestep * np.arange(-past, future)
-    columns = [hold(recording.time, recording[f"ctrl/{model.actuator(i).name}"], at) for i in range(model.nu)]
+    columns = [hold(recording.time, recording[f"ctrl/{name}"], at) for name in actuator_names(model)]
     return np.stack(columns, axis=-1) if columns else np.empty((*at.shape, 0))
 
 
@@ -246,14 +246,13 @@ def _is_usable(recording: Recording, grid: Recording, start: int, end: int) -> b
 
 def _check_columns(model: mujoco.MjModel, recording: Recording, first: Recording, known: dict[str, Channel]) -> None:
     """Raise ValueError where a recording cannot be replayed."""
-    if unnamed := [str(i) for i in range(model.nu) if not model.actuator(i).name]:
+    actuators = actuator_names(model)
+    if unnamed := [str(i) for i, name in enumerate(actuators) if not name]:
         raise ValueError(
             f"the model's actuators {', '.join(unnamed)} have no name; commands are read from columns ctrl/NAME: give"
             " them names in the MJCF"
         )
-    if missing := [
-        model.actuator(i).name for i in range(model.nu) if f"ctrl/{model.actuator(i).name}" not in recording.columns
-    ]:
+    if missing := [name for name in actuators if f"ctrl/{name}" not in recording.columns]:
         raise ValueError(
             f"{recording.name} has no command column for the actuators {', '.join(missing)}; it has"
             f" {', '.join(recording.commands) or 'none'}"
