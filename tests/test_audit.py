@@ -277,6 +277,48 @@ def test_actuators_without_a_name_are_told():
         audited(GOOD, spec.compile())
 
 
+def set_off(seed: int, held: float) -> Recording:
+    """Two seconds at 200 Hz of a servo driven arm that stands for so long and then follows a sine, with noise."""
+    model = mujoco.MjModel.from_xml_string("""
+<mujoco><option timestep="0.005" integrator="implicitfast"/><worldbody><body><joint name="arm" axis="0 0 1"/>
+<geom size="0.1" pos="0.3 0 0" mass="1"/></body></worldbody>
+<actuator><position name="arm" joint="arm" kp="100" kv="10"/></actuator></mujoco>""")
+    rng, data, time = np.random.default_rng(seed), mujoco.MjData(model), 0.005 * np.arange(400)
+    phase, rows = rng.uniform(0, 6), []
+    commands = np.where(time < held, 0.0, 0.5 * np.sin(5 * (time - held) + phase))
+    for command in commands:
+        rows.append(data.qpos[0])
+        data.ctrl[:] = command
+        mujoco.mj_step(model, data)
+    measured = np.array(rows) + rng.normal(0, 5e-4, 400)
+    return Recording(time, {"ctrl/arm": commands, "qpos/arm": measured}, "set off", at_rest=True)
+
+
+@pytest.mark.parametrize("held", [0.0, 0.02, 0.3])
+def test_a_recording_that_begins_at_rest_passes(held):
+    """Also where its command jumps as it begins."""
+    for seed in range(20):
+        assert not [f for f in audit(set_off(seed, held)) if f.check == "rest"], seed
+
+
+def test_a_recording_that_does_not_begin_at_rest_as_it_is_said_to_is_told():
+    told = 0
+    for seed in range(20):
+        recording = set_off(seed, 0.0).select(start=0.4 + 0.02 * seed)
+        assert not recording.at_rest  # what is cut off its beginning is no longer known to be at rest
+        claimed = replace(recording, at_rest=True)
+        speed = abs(np.polyfit(recording.time[:9], recording["qpos/arm"][:9], 1)[0])
+        found = [f for f in audit(claimed) if f.check == "rest"]
+        told += bool(found)
+        assert found or speed < 1.0, f"{seed}: {speed:.2g} rad/s"
+        assert not [f for f in audit(recording) if f.check == "rest"]
+    assert told > 10
+    with pytest.raises(
+        ValueError, match=r"qpos/arm: the recording is said to begin at rest, but it moves by .* in its"
+    ):
+        audited(claimed)
+
+
 @pytest.mark.parametrize("what", ["nan", "clipped", "late velocity", "missing actuator", "degrees without a range"])
 def test_a_defect_of_one_channel_is_not_pinned_on_another(what):
     channel = {"missing actuator": "rail"}.get(what, "elbow")

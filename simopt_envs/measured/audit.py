@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from simopt_envs.measured.audit_model import LEAST_SAMPLES, against_model
 from simopt_envs.measured.recording import Finding, Recording
 from simopt_envs.measured.resample import GAP_PERIODS, Array, resolution, sample_period
+from simopt_envs.measured.smoothing import smooth
 
 JITTER = 0.1  # an interval that differs from the median by more than this share of it is jittered ...
 JITTERED_SHARE = 0.01  # ... worth a word where more than this share of them is
@@ -29,6 +30,9 @@ FROZEN_SAMPLES = 50  # consecutive equal positions that are entered at speed: a 
 FROZEN_JOLT = 3.0  # ... with this many times the change of speed that the signal shows elsewhere
 JUMP = 10.0  # times what is covered in the intervals around and in the median one, between two samples ...
 JUMP_SHARE = 0.01  # ... and this share of the range
+UNREST = 6.0  # times as far as its largest acceleration takes a position from rest, smoothed as that is, ...
+UNREST_NOISE = 5.0  # ... and so many standard deviations of its noise: it was on its way
+UNREST_SECONDS = 0.08  # in which that is looked for: at speed it goes farther first, under acceleration later
 ROUGH_SHARE = 0.25  # of samples that leap and at once return, as two of three do in noise; a motion turns slowly
 
 
@@ -36,10 +40,10 @@ def audit(recording: Recording, model: mujoco.MjModel | None = None) -> list[Fin
     """Check a recording, and against a model where there is one.
 
     Without a model: too few samples, time (not finite, backward, duplicate, jittered, gaps, no plausible rate), samples
-    that are missing, channels that are constant or clipped. With one: columns that it does not know, actuators and
-    joints without a column, values that cannot be in radians or metres or within the joint's or actuator's range,
-    velocities that are not the derivatives of their positions, or lag them, and commands that lag, scale, oppose or
-    are swapped against the torque that the motion needed.
+    that are missing, channels that are constant or clipped, positions that move where all is said to rest. With one:
+    columns that it does not know, actuators and joints without a column, values that cannot be in radians or metres or
+    within the joint's or actuator's range, velocities that are not the derivatives of their positions, or lag them, and
+    commands that lag, scale, oppose or are swapped against the torque that the motion needed.
 
     Returns:
         What was found, errors first; the recording's own warnings are among them.
@@ -47,9 +51,10 @@ def audit(recording: Recording, model: mujoco.MjModel | None = None) -> list[Fin
     findings = [*recording.warnings, *_time(recording)]
     if not any(finding.severity == "error" for finding in findings):
         of_values = [f for name, values in recording.columns.items() for f in _values(name, recording.time, values)]
-        findings += of_values
+        broken = {f.channel for f in of_values if f.severity == "error"}
+        findings += [*of_values, *_rest(recording, broken)]
         if model is not None:
-            findings += against_model(recording, model, {f.channel for f in of_values if f.severity == "error"})
+            findings += against_model(recording, model, broken)
     return sorted(dict.fromkeys(findings), key=lambda finding: finding.severity != "error")
 
 
@@ -152,6 +157,23 @@ def _values(name: str, time: Array, values: Array) -> Iterator[Finding]:
         usual = float(np.percentile(np.abs(good[10:] - 2 * good[5:-5] + good[:-10]), 99))
         if arrivals.max(initial=0.0) > max(CLIPPED_STEPS * step, FROZEN_JOLT * usual):
             yield Finding.warning(name, "constant", f"freezes in full motion for {FROZEN_SAMPLES} samples or more")
+
+
+def _rest(recording: Recording, broken: set[str]) -> Iterator[Finding]:
+    """Positions that are on their way at the first sample, where the recording is said to begin at rest."""
+    if not recording.at_rest:
+        return
+    grid = recording.resample(recording.period)
+    for name in grid.signals:
+        if not name.startswith(("qpos/", "site/")) or name in broken:
+            continue
+        smoothed = smooth(grid[name], grid.period)
+        after = grid.period * np.arange(max(3, round(UNREST_SECONDS / grid.period)))
+        moved = grid[name][: len(after)] - grid[name][0]
+        from_rest = 0.5 * UNREST * np.nanmax(np.abs(smoothed.acceleration)) * after**2
+        if np.any(np.abs(moved) > from_rest + UNREST_NOISE * np.sqrt(2) * smoothed.noise):
+            told = f"it moves by {moved[-1]:.3g} in its first {after[-1]:.3g} s, faster than its accelerations allow"
+            yield Finding.error(name, "rest", f"the recording is said to begin at rest, but {told}")
 
 
 def _jumps(name: str, time: Array, values: Array, step: float) -> Iterator[Finding]:
