@@ -51,7 +51,8 @@ def windows():
 def test_overlays_show_channels_that_move(windows):
     simulated = [windows.measured + offset for offset in (0.1, 0.05, 0.0)]
     figure = overlay_figure(windows, simulated, np.full(2, 1e-3))
-    assert [axis.get_ylabel() for axis in figure.axes] == ["qpos/elbow [rad]", ""]
+    assert [axis.get_title(loc="left") for axis in figure.axes] == ["qpos/elbow", "simulated minus measured"]
+    assert [axis.get_ylabel() for axis in figure.axes] == ["[rad]", ""]
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
     assert labels == ["measured", "as given", "refitted", "repaired"]
     errors = [line for line in figure.axes[1].lines if line.get_label() == "repaired"]

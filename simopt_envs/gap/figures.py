@@ -95,7 +95,7 @@ def overlay_figure(windows: Windows, simulated: Sequence[Array], noise: Array) -
     moves = windows.channel_scale() > _MOVING * noise
     ordered = np.argsort(-refit.max(axis=0) * (moves if moves.any() else 1.0))
     chosen = ordered[: min(_MOST_CHANNELS, int(moves.sum()) or len(moves))]
-    figure = Figure(figsize=(_WIDTH, 1.5 * len(chosen) + 0.7), layout="constrained")
+    figure = Figure(figsize=(_WIDTH, 1.6 * len(chosen) + 0.7), layout="constrained")
     panels = figure.subplots(len(chosen), 2, squeeze=False, sharex="row")
     for (left, right), c in zip(panels, chosen, strict=True):
         around = _neighbours(windows, int(np.argmax(refit[:, c])))
@@ -109,10 +109,10 @@ def overlay_figure(windows: Windows, simulated: Sequence[Array], noise: Array) -
         _limit(left, [windows.measured[around, :, c], *(s[around, :, c] for s in simulated[1:])])
         _limit(right, [s[around, :, c] - windows.measured[around, :, c] for s in simulated[1:]])
         channel = windows.channels[c]
-        left.set_ylabel(f"{channel.name} [{channel.unit or '1'}]", fontsize=8)
+        left.set_ylabel(f"[{channel.unit or '1'}]")
+        left.set_title(channel.name)
+        right.set_title("simulated minus measured", fontsize=8, color=GREY, weight="normal")
         left.set_title(windows.recording[around[0]], fontsize=7.5, color=GREY, loc="right", weight="normal")
-    panels[0, 0].set_title("Measured and simulated")
-    panels[0, 1].set_title("Simulated minus measured")
     for axis in panels[-1]:
         axis.set_xlabel("time in the recording [s]")
     handles, labels = panels[0, 0].get_legend_handles_labels()
@@ -130,7 +130,7 @@ def error_figure(values: Sequence[float], intervals: Sequence[tuple[float, float
         intervals: 95 %, by bootstrap over recordings.
         noise_floor: what a right model would have.
     """
-    figure = Figure(figsize=(_WIDTH, 0.55 + 0.5 * len(values)), layout="constrained")
+    figure = Figure(figsize=(_WIDTH, 0.85 + 0.5 * len(values)), layout="constrained")
     axis = figure.add_subplot()
     colours = ("#A3A8AF", ORANGE, BLUE)[: len(values)]
     ends = np.array(intervals)
@@ -152,7 +152,7 @@ def error_figure(values: Sequence[float], intervals: Sequence[tuple[float, float
     axis.grid(visible=False, axis="y")
     axis.margins(x=0.12)
     axis.set_xlabel("normalised RMSE on recordings that no fit saw; bars: 95 % by bootstrap over recordings")
-    axis.legend(loc="lower right")
+    figure.legend(loc="outside upper right")
     return figure
 
 
