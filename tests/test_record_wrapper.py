@@ -68,6 +68,18 @@ class Robot(gym.Wrapper):
         return self
 
 
+def test_commands_that_cannot_be_recorded_are_told(tmp_path):
+    """Of two actuators without a name on one joint; one alone is called as its joint."""
+    env = Arm()
+    env.model = mujoco.MjModel.from_xml_string(ARM.replace('name="motor" ', ""))
+    assert "ctrl/hinge" in RecordEpisodes(env, tmp_path)._source.command_names
+    env.model = mujoco.MjModel.from_xml_string(
+        ARM.replace('<motor name="motor" joint="hinge"/>', '<motor joint="hinge"/>' * 2)
+    )
+    with pytest.warns(UserWarning, match="the commands of actuators 0, 1, which have no name, are not recorded"):
+        RecordEpisodes(env, tmp_path)
+
+
 def run(env: gym.Env, episodes: int, steps: int = 8) -> list[float]:
     rng = np.random.default_rng(5)
     actions = []

@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
-from simopt_envs.measured.channels import model_channels, read_channels
+from simopt_envs.measured.channels import actuator_names, model_channels, read_channels
 from simopt_envs.measured.recording import Recording
 from simopt_envs.physics.parameters import unknown_name
 
@@ -178,6 +178,8 @@ class _ModelSource:
         self._commands = [c for c in channels if c.kind == "ctrl"]
         self._signals = [c for c in channels if c.kind != "ctrl"]
         self.command_names = [c.name for c in self._commands]
+        if nameless := [str(i) for i, name in enumerate(actuator_names(self._env.model)) if not name]:
+            gym.logger.warn(f"the commands of actuators {', '.join(nameless)}, which have no name, are not recorded")
         self.signal_names = [c.name for c in self._signals]
         self._scratch = mujoco.MjData(self._env.model)
         self._state = np.empty(mujoco.mj_stateSize(self._env.model, mujoco.mjtState.mjSTATE_INTEGRATION))
