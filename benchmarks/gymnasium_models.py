@@ -52,6 +52,7 @@ CASES = {
         0.2,
         ("obj_slidey", "obj_slidex", "goal_slidey", "goal_slidex"),
     ),
+    "half_cheetah": Case((0.3,) * 6, "fthigh", 2.0),
 }
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import mujoco
@@ -28,6 +29,7 @@ from simopt_envs.gap.search import Progress, Search
 from simopt_envs.gap.separate import separate
 from simopt_envs.gap.sizes import of_best_length
 from simopt_envs.gap.thresholds import LARGE
+from simopt_envs.gap.timestep import finer, halved, promises, takes_all, takes_most, with_warning
 from simopt_envs.gap.trial import Base, Data
 from simopt_envs.gap.wild_starts import of_linear_starts, without_wild_columns, without_wild_starts
 from simopt_envs.measured.channels import actuator_names
@@ -150,13 +152,13 @@ def solve(
     null: Base | None = None,
 ) -> Gap:
     """What is missing, see :func:`find_gap`; ``null``, if it is there already, is what :func:`refitted` gives."""
-    if problem.in_short_windows is not None:
-        null = null or refitted(problem, progress)
-        if null.excess >= LARGE:
-            with muted():
-                short = problem.in_short_windows()
-            if short.data.fitted.names == problem.data.fitted.names:  # they show as much
-                problem, null = short, None
+    null = null or refitted(problem, progress)
+    if problem.in_short_windows is not None and null.excess >= LARGE:
+        with muted():
+            short = problem.in_short_windows()
+        if short.data.fitted.names == problem.data.fitted.names:  # they show as much
+            problem, null = short, refitted(short, progress)
+    problem, null = at_a_timestep_that_fits(problem, null, progress)
     plain, data = problem.plain, problem.data
     seen = tuple(c for effect in effects for c in _places(effect, plain.model) if _shows(c, plain.model, data.fitted))
     with muted():
@@ -166,6 +168,21 @@ def solve(
             final = of_best_length(found.final, found.data, search.fit, progress, problem.keyframe)
             found = replace(found, final=final)
         return _gap(problem, found)
+
+
+def at_a_timestep_that_fits(problem: Problem, null: Base, progress: Progress = lambda *_: None) -> tuple[Problem, Base]:
+    """With half the model's timestep, if that leaves no more than noise; with a warning, if it takes most."""
+    plain, data = halved(problem.plain), finer(problem.data)
+    with muted():
+        if not promises(null, Hypothesis(plain, (), problem.motion), data):
+            return problem, null
+    half = replace(problem, plain=plain, data=data, longer=tuple(map(finer, problem.longer)))
+    found = refitted(half, progress)
+    if not takes_most(null, found):
+        return problem, null
+    warned = partial(with_warning, timestep=float(plain.model.opt.timestep), null=null, half=found)
+    fits, best = (half, found) if takes_all(found) else (problem, null)
+    return replace(fits, data=warned(fits.data), longer=tuple(map(warned, fits.longer))), best
 
 
 def _without_wild_starts(hypothesis: Hypothesis, data: Data) -> Data:

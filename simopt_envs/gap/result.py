@@ -19,6 +19,7 @@ from simopt_envs.gap.hypothesis import Candidate
 from simopt_envs.gap.localise import Row
 from simopt_envs.gap.repair import column_lines, difference, repaired, to_xml_in
 from simopt_envs.gap.thresholds import CONFIDENT, EXPLAINED, LEAST_SHARE
+from simopt_envs.gap.timestep import TIMESTEP
 from simopt_envs.gap.trial import Data, of_median_window
 from simopt_envs.measured.recording import Finding
 from simopt_envs.physics.effects import object_name
@@ -108,7 +109,8 @@ class Gap:
     def __str__(self) -> str:
         numbers = f"held-out error {self.errors.refit:.3g} -> {self.errors.after:.3g}"
         numbers += f" (model as given {self.errors.before:.3g}, noise floor {self.errors.noise_floor:.3g})"
-        return "\n  ".join([self.verdict, *map(str, self.effects), *self.remarks, numbers])
+        of_step = [warning.message for warning in self.warnings if warning.check == TIMESTEP]
+        return "\n  ".join([self.verdict, *map(str, self.effects), *self.remarks, *of_step, numbers])
 
     def to_dict(self) -> dict[str, Any]:
         """As in ``gap.json``."""

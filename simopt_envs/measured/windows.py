@@ -73,6 +73,11 @@ class Windows:
         shown = [c for c, channel in enumerate(self.channels) if channel.name in names]
         return replace(self, channels=tuple(self.channels[c] for c in shown), measured=self.measured[..., shown])
 
+    def at_half_the_timestep(self) -> Windows:
+        """The same for a model with half the timestep."""
+        commands, past = (np.repeat(values, 2, axis=1) for values in (self.commands, self.past_commands))
+        return replace(self, commands=commands, past_commands=past, stride=2 * self.stride)
+
     def find(self, others: Windows) -> NDArray[np.intp]:
         """Where some of them are among all, (k,)."""
         wanted = set(zip(others.recording, others.start_time.tolist(), strict=True))
