@@ -59,7 +59,7 @@ def test_half_the_timestep_is_taken_where_it_leaves_no_more_than_noise():
     case, spec = CASES["half_cheetah"], nominal("half_cheetah")
     system = hidden(spec, case, friction=0.0)
     problem = read(spec, [recorded(system, case, seed) for seed in range(8)])
-    found, null = at_a_timestep_that_fits(problem, refitted(problem))
+    found, null = at_a_timestep_that_fits(problem, refitted(problem), problem.data)
     assert found.plain.model.opt.timestep == spec.option.timestep / 2
     assert abs(null.excess) < 0.03
     (told,) = [str(warning) for warning in found.data.warnings if warning.check == "timestep"]

@@ -152,37 +152,62 @@ def solve(
     null: Base | None = None,
 ) -> Gap:
     """What is missing, see :func:`find_gap`; ``null``, if it is there already, is what :func:`refitted` gives."""
+    model, fitted = problem.plain.model, problem.data.fitted
+    seen = tuple(c for effect in effects for c in _places(effect, model) if _shows(c, model, fitted))
+    if not seen:
+        raise ValueError("there is nothing to search: no effect can act in this model and show in its data")
     null = null or refitted(problem, progress)
     if problem.in_short_windows is not None and null.excess >= LARGE:
         with muted():
             short = problem.in_short_windows()
         if short.data.fitted.names == problem.data.fitted.names:  # they show as much
             problem, null = short, refitted(short, progress)
-    problem, null = at_a_timestep_that_fits(problem, null, progress)
-    plain, data = problem.plain, problem.data
-    seen = tuple(c for effect in effects for c in _places(effect, plain.model) if _shows(c, plain.model, data.fitted))
+
+    def searched(problem: Problem, null: Base, directory: str | Path | None) -> tuple[Search, Explanation]:
+        given = problem.plain, problem.data, problem.motion, seen, progress, engine, directory, problem.longer, null
+        search = Search(*given)
+        return search, search.run()
+
     with muted():
-        search = Search(plain, data, problem.motion, seen, progress, engine, directory, problem.longer, null)
-        found = search.run()
+        problem, null = at_a_timestep_that_fits(problem, null, problem.data, progress)
+        search, found = searched(problem, null, directory)
+        if len(found.stages) > 1 and (len(found.effects) > 1 or judge(found) != "named"):
+            half, _ = at_a_timestep_that_fits(problem, found.stages[1].base, found.data, progress)
+            if half.plain is not problem.plain:
+                problem, kept = half, None if directory is None else Path(directory) / "half_the_timestep"
+                search, found = searched(problem, refitted(problem, progress), kept)
+            elif half is not problem:
+                told = (*found.data.warnings, half.data.warnings[-1])
+                found = replace(found, data=replace(found.data, warnings=told))
         if judge(found) == "partly":
             final = of_best_length(found.final, found.data, search.fit, progress, problem.keyframe)
             found = replace(found, final=final)
         return _gap(problem, found)
 
 
-def at_a_timestep_that_fits(problem: Problem, null: Base, progress: Progress = lambda *_: None) -> tuple[Problem, Base]:
-    """With half the model's timestep, if that leaves no more than noise; with a warning, if it takes most."""
-    plain, data = halved(problem.plain), finer(problem.data)
+def at_a_timestep_that_fits(
+    problem: Problem, base: Base, data: Data, progress: Progress = lambda *_: None
+) -> tuple[Problem, Base]:
+    """With half the model's timestep, if that leaves no more than noise; with a warning, if it takes most.
+
+    Args:
+        problem: at the timestep that it has.
+        base: the refitted model, or one with an effect, there.
+        data: that it was fitted to.
+        progress: is told of a fit.
+    """
+    plain, effects = halved(problem.plain), base.hypothesis.candidates
     with muted():
-        if not promises(null, Hypothesis(plain, (), problem.motion), data):
-            return problem, null
-    half = replace(problem, plain=plain, data=data, longer=tuple(map(finer, problem.longer)))
-    found = refitted(half, progress)
-    if not takes_most(null, found):
-        return problem, null
-    warned = partial(with_warning, timestep=float(plain.model.opt.timestep), null=null, half=found)
-    fits, best = (half, found) if takes_all(found) else (problem, null)
-    return replace(fits, data=warned(fits.data), longer=tuple(map(warned, fits.longer))), best
+        if not promises(base, Hypothesis(plain, effects, problem.motion), finer(data)):
+            return problem, base
+        found = Search(plain, finer(data), problem.motion, (), progress).base(effects, base.fit.u if effects else None)
+    if not takes_most(base, found):
+        return problem, base
+    warned = partial(with_warning, timestep=float(plain.model.opt.timestep), null=base, half=found)
+    if not takes_all(found):
+        return replace(problem, data=warned(problem.data), longer=tuple(map(warned, problem.longer))), base
+    longer = tuple(warned(finer(long)) for long in problem.longer)
+    return replace(problem, plain=plain, data=warned(finer(problem.data)), longer=longer), found
 
 
 def _without_wild_starts(hypothesis: Hypothesis, data: Data) -> Data:

@@ -44,7 +44,7 @@ class Search:
         plain: the model and its plain parameters.
         data: the windows.
         motion: of the recordings.
-        candidates: what may be missing.
+        candidates: what may be missing, one at least.
         progress: is told of it.
         engine: tries and fits the candidates; threads of this process by default.
         directory: keeps finished fits, from which a search of the same goes on; None for none.
@@ -74,13 +74,7 @@ class Search:
         self._probed: dict[Candidate, Probed] = {}
 
     def run(self) -> Explanation:
-        """Add effects while they earn it, then take away those that the others have made needless.
-
-        Raises:
-            ValueError: without candidates.
-        """
-        if not self.candidates:
-            raise ValueError("there is nothing to search: no effect can act in this model and show in its data")
+        """Add effects while they earn it, then take away those that the others have made needless."""
         base = self._null or self.base()
         stage = self._first(self._in_longer_windows(base))
         self._tolerance = tolerance_of(min((score.trial for score in stage.scores), key=lambda trial: trial.excess))

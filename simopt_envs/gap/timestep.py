@@ -40,7 +40,7 @@ def promises(null: Base, hypothesis: Hypothesis, data: Data) -> bool:
     """Whether a finer hypothesis predicts what was held out clearly better, to first order from where a fit ended.
 
     Args:
-        null: the refitted model.
+        null: the refitted model, or one with an effect.
         hypothesis: the same with half the timestep.
         data: windows for it.
     """
@@ -51,7 +51,7 @@ def promises(null: Base, hypothesis: Hypothesis, data: Data) -> bool:
     held_out = Misfit(hypothesis, data.held_out).with_noise(null.held_out_noise).errors(u)[0]
     residual = replace(null.fit, errors=fitted).residual
     step = lsq_linear(null.fit.rows, -residual, null.within, method="bvls").x
-    predicted = held_out + null.held_out.jacobian @ step
+    predicted = held_out + null.held_out.jacobian / null.tolerance[:, None] @ step
     return bool(0.5 * np.sum((null.held_out.errors / null.tolerance) ** 2 - predicted**2) > EVIDENCE)
 
 
