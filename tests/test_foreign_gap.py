@@ -43,6 +43,13 @@ def test_an_actuator_without_a_name_is_called_as_what_it_alone_acts_on(actuators
     assert [n for n in model_channels(model) if n.startswith("ctrl/")] == [f"ctrl/{name}" for name in names if name]
 
 
+def test_an_actuator_that_acts_on_something_else_stays_without_a_name():
+    """As kinds of transmission that are newer than this code do."""
+    model = mujoco.MjModel.from_xml_string(DRIVES.format('<motor joint="hip"/>'))
+    model.actuator_trntype[0] = int(mujoco.mjtTrn.mjTRN_UNDEFINED)
+    assert actuator_names(model) == [""]
+
+
 @needs_effects
 def test_from_episodes_of_gymnasiums_reacher_to_its_repair(tmp_path, monkeypatch, capsys):
     """Its actuators have no names, and its model lacks the friction that the recorded one has in its second joint."""

@@ -60,9 +60,10 @@ def actuator_names(model: mujoco.MjModel) -> list[str]:
     One without a name, as most of Gymnasium's, has that of what it acts on, where no other actuator has it; else "".
     """
     given = [model.actuator(i).name for i in range(model.nu)]
+    kinds = [_DRIVEN.get(mujoco.mjtTrn(kind), mujoco.mjtObj.mjOBJ_UNKNOWN) for kind in model.actuator_trntype]
     acts_on = [
-        mujoco.mj_id2name(model, _DRIVEN[mujoco.mjtTrn(model.actuator_trntype[i])], model.actuator_trnid[i, 0]) or ""
-        for i in range(model.nu)
+        mujoco.mj_id2name(model, kind, target) or ""
+        for kind, target in zip(kinds, model.actuator_trnid[:, 0], strict=True)
     ]
     nameless = [target for name, target in zip(given, acts_on, strict=True) if not name]
     taken = {*given, *(target for target in nameless if nameless.count(target) > 1)}
