@@ -60,10 +60,10 @@ def actuator_names(model: mujoco.MjModel) -> list[str]:
     One without a name, as most of Gymnasium's, has that of what it acts on, where no other actuator has it; else "".
     """
     given = [model.actuator(i).name for i in range(model.nu)]
-    kinds = [_DRIVEN.get(mujoco.mjtTrn(kind), mujoco.mjtObj.mjOBJ_UNKNOWN) for kind in model.actuator_trntype]
     acts_on = [
-        mujoco.mj_id2name(model, kind, target) or ""
-        for kind, target in zip(kinds, model.actuator_trnid[:, 0], strict=True)
+        mujoco.mj_id2name(model, _DRIVEN.get(mujoco.mjtTrn(kind), mujoco.mjtObj.mjOBJ_UNKNOWN), target) or ""
+        # only as many as there are commands: effects add actuators that take none
+        for kind, target in zip(model.actuator_trntype[: model.nu], model.actuator_trnid[: model.nu, 0], strict=True)
     ]
     nameless = [target for name, target in zip(given, acts_on, strict=True) if not name]
     taken = {*given, *(target for target in nameless if nameless.count(target) > 1)}
