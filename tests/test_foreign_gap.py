@@ -51,6 +51,21 @@ def test_an_actuator_that_acts_on_something_else_stays_without_a_name():
 
 
 @needs_effects
+def test_an_actuator_of_several_commands_is_refused():
+    model = mujoco.MjModel.from_xml_string(DRIVES.format('<motor joint="hip"/><pid name="servo" joint="knee"/>'))
+    with pytest.raises(ValueError, match="actuator 'servo' takes 2 commands, expected one"):
+        actuator_names(model)
+
+
+@needs_effects
+def test_an_actuator_that_takes_no_command_is_passed_over():
+    spec = mujoco.MjSpec.from_string(DRIVES.format('<motor joint="hip"/>'))
+    EFFECTS["cogging"].add(spec, "joint:hip")
+    spec.add_actuator(name="later", target="knee", trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    assert actuator_names(spec.compile()) == ["hip", "later"]
+
+
+@needs_effects
 def test_from_episodes_of_gymnasiums_reacher_to_its_repair(tmp_path, monkeypatch, capsys):
     """Its actuators have no names, and its model lacks the friction that the recorded one has in its second joint."""
     monkeypatch.setattr("simopt_envs.gap.find_gap", partial(find_gap, effects=FEW))

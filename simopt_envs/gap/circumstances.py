@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_opening
 
-from simopt_envs.measured.channels import Channel
+from simopt_envs.measured.channels import Channel, actuator_names
 from simopt_envs.measured.smoothing import smooth
 from simopt_envs.measured.windows import Windows, simulate_windows
 from simopt_envs.physics.effects import object_name
@@ -115,7 +115,7 @@ def circumstances(model: mujoco.MjModel, windows: Windows) -> Circumstances:
     since = windows.start_time - np.array([begins[name] for name in windows.recording])
     return Circumstances(
         joints=tuple(joints),
-        actuators=tuple(model.actuator(i).name for i in range(model.nu)),
+        actuators=tuple(actuator_names(model)),
         position=qpos[..., coordinates],
         velocity=qvel[..., dofs],
         acceleration=qacc[..., dofs],

@@ -32,7 +32,7 @@ from simopt_envs.gap.thresholds import LARGE
 from simopt_envs.gap.timestep import finer, halved, promises, takes_all, takes_most, with_warning
 from simopt_envs.gap.trial import Base, Data
 from simopt_envs.gap.wild_starts import of_linear_starts, without_wild_columns, without_wild_starts
-from simopt_envs.measured.channels import actuator_names
+from simopt_envs.measured.channels import actuator_names, commanded_actuators
 from simopt_envs.measured.mapping import LogMapping
 from simopt_envs.measured.readers import load_recordings
 from simopt_envs.measured.recording import Recording
@@ -258,9 +258,9 @@ def _spec(model: str | Path | mujoco.MjSpec) -> mujoco.MjSpec:
         spec = mujoco.MjSpec.from_file(str(model))
     else:
         raise FileNotFoundError(f"there is no model {model}")
-    names = actuator_names(spec.compile())
-    for actuator in spec.actuators:
-        actuator.name = names[actuator.id]
+    compiled = spec.compile()
+    for i, name in zip(commanded_actuators(compiled), actuator_names(compiled), strict=True):
+        spec.actuators[i].name = name
     return spec
 
 

@@ -54,17 +54,31 @@ _DRIVEN = {
 }
 
 
+def commanded_actuators(model: mujoco.MjModel) -> list[int]:
+    """The actuators that take a command, in the order of commands (nu,); some that effects add take none.
+
+    Raises:
+        ValueError: if an actuator takes several commands, as ``<pid>`` can.
+    """
+    takes = getattr(model, "actuator_ctrlnum", np.ones(model.nu, dtype=np.int32))  # one each before MuJoCo 3.15
+    if several := np.flatnonzero(takes > 1).tolist():
+        raise ValueError(
+            f"actuator {model.actuator(several[0]).name or several[0]!r} takes {takes[several[0]]} commands, "
+            "expected one: give the model an actuator for each"
+        )
+    return np.flatnonzero(takes).tolist()
+
+
 def actuator_names(model: mujoco.MjModel) -> list[str]:
-    """What each actuator's command is called in recordings.
+    """What each command (nu,) is called in recordings: as its actuator, see :func:`commanded_actuators`.
 
     One without a name, as most of Gymnasium's, has that of what it acts on, where no other actuator has it; else "".
     """
-    given = [model.actuator(i).name for i in range(model.nu)]
-    acts_on = [
-        mujoco.mj_id2name(model, _DRIVEN.get(mujoco.mjtTrn(kind), mujoco.mjtObj.mjOBJ_UNKNOWN), target) or ""
-        # only as many as there are commands: effects add actuators that take none
-        for kind, target in zip(model.actuator_trntype[: model.nu], model.actuator_trnid[: model.nu, 0], strict=True)
-    ]
+    drives = commanded_actuators(model)
+    given = [model.actuator(i).name for i in drives]
+    kinds = [_DRIVEN.get(mujoco.mjtTrn(model.actuator_trntype[i]), mujoco.mjtObj.mjOBJ_UNKNOWN) for i in drives]
+    targets = model.actuator_trnid[drives, 0].tolist()
+    acts_on = [mujoco.mj_id2name(model, kind, i) or "" for kind, i in zip(kinds, targets, strict=True)]
     nameless = [target for name, target in zip(given, acts_on, strict=True) if not name]
     taken = {*given, *(target for target in nameless if nameless.count(target) > 1)}
     return [name or ("" if target in taken else target) for name, target in zip(given, acts_on, strict=True)]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
-from simopt_envs.measured.channels import Channel, read_channels
+from simopt_envs.measured.channels import Channel, commanded_actuators, read_channels
 from simopt_envs.measured.resample import Array
 from simopt_envs.measured.states import States
 from simopt_envs.physics.parameters import ParameterSpace
@@ -177,12 +177,12 @@ def settle_actuators(model: mujoco.MjModel, data: mujoco.MjData, past: Array) ->
     A filter had settled on the first of these, and an integrated setpoint is where the joint is.
     """
     mujoco.mj_fwdPosition(model, data)
-    for i in range(model.nu):
+    for command, i in enumerate(commanded_actuators(model)):
         first = int(model.actuator_actadr[i])
         match mujoco.mjtDyn(model.actuator_dyntype[i]):
             case mujoco.mjtDyn.mjDYN_FILTER | mujoco.mjtDyn.mjDYN_FILTEREXACT:
                 lag, delay = float(model.actuator_dynprm[i, 0]), float(model.actuator_delay[i])
-                arrived = past[: max(1, len(past) - round(delay / model.opt.timestep)), i]
+                arrived = past[: max(1, len(past) - round(delay / model.opt.timestep)), command]
                 kept = np.exp(-model.opt.timestep / max(lag, mujoco.mjMINVAL)) ** np.arange(len(arrived) + 1)[::-1]
                 data.act[first] = np.diff(kept) @ arrived + kept[0] * arrived[0]
             case mujoco.mjtDyn.mjDYN_INTEGRATOR:
@@ -190,7 +190,7 @@ def settle_actuators(model: mujoco.MjModel, data: mujoco.MjData, past: Array) ->
         length = int(model.actuator_history[i, 0]) if model.nhistory else 0
         if length:
             times = model.opt.timestep * np.arange(-length, 0)
-            mujoco.mj_initCtrlHistory(model, data, i, times, np.ascontiguousarray(past[-length:, i, None]))
+            mujoco.mj_initCtrlHistory(model, data, i, times, np.ascontiguousarray(past[-length:, command, None]))
 
 
 def _initial_states(model: mujoco.MjModel, windows: Windows, starts: States, settled: dict[str, Array] | None) -> Array:
