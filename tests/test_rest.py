@@ -83,6 +83,23 @@ def test_commands_that_hold_are_those_of_the_weight_in_servos_and_of_others_the_
     assert holding_commands(model, HELD, np.array([0.7, 0.8]))[0] == 0.7, "too weak to hold it"
 
 
+@needs_effects
+def test_drives_hold_against_actuators_that_take_no_command():
+    """As a repaired model has them, here before a drive, which is held back by a dead time."""
+    spec = mujoco.MjSpec.from_string(HUNG.replace('<motor name="cart" joint="cart"/>', ""))
+    EFFECTS["cogging"].add(spec, "joint:arm")
+    spec.add_actuator(name="cart", target="cart", trntype=mujoco.mjtTrn.mjTRN_JOINT, delay=0.02, nsample=12)
+    model = spec.compile()
+    model.actuator("arm.cogging").biasprm[:3] = 0.5, 4.0, 0.3
+    data = mujoco.MjData(model)
+    data.qpos[:] = HELD
+    held = holding_commands(model, HELD, np.full(2, np.nan))
+    settle_actuators(model, data, np.tile(held, (20, 1)))
+    data.ctrl[:] = held
+    mujoco.mj_step(model, data, 500)
+    np.testing.assert_allclose(data.qpos, HELD, atol=1e-6)
+
+
 def test_a_recording_from_rest_starts_at_rest_and_what_nothing_shows_near_its_reference():
     model, log = from_rest(["qpos/arm", "qpos/cart"])
     samples = np.array([0, 50])

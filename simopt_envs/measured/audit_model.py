@@ -8,10 +8,11 @@ import mujoco
 import numpy as np
 from scipy import signal
 
-from simopt_envs.measured.channels import Channel, actuator_names, model_channels
+from simopt_envs.measured.channels import Channel, actuator_names, commanded_actuators, model_channels
 from simopt_envs.measured.recording import Finding, Recording
 from simopt_envs.measured.resample import Array
 from simopt_envs.measured.smoothing import Smoothed, smooth
+from simopt_envs.physics.effects.actuators import moments
 from simopt_envs.physics.parameters import unknown_name
 
 LEAST_SAMPLES = 20  # fewer cannot be smoothed, let alone fitted
@@ -237,7 +238,7 @@ def _torques(grid: Recording, model: mujoco.MjModel, joints: dict[int, Smoothed]
     state = [np.stack([getattr(s, what) for s in order], axis=1) for what in ("value", "velocity", "acceleration")]
     commands = np.stack([grid[f"ctrl/{name}"] for name in actuator_names(model)], axis=1)
     needed, given = np.full((len(grid), model.nv), np.nan), np.zeros((len(grid), model.nv, model.nu))
-    moments = np.zeros((model.nu, model.nv))
+    drives = commanded_actuators(model)
     for t in np.flatnonzero(np.isfinite(np.concatenate(state, axis=1)).all(axis=1)):
         data.qpos[:], data.qvel[:], data.qacc[:] = (part[t] for part in state)
         data.ctrl[:] = 0
@@ -246,11 +247,8 @@ def _torques(grid: Recording, model: mujoco.MjModel, joints: dict[int, Smoothed]
         idle, idle_force = data.qfrc_actuator.copy(), data.actuator_force.copy()
         data.ctrl[:] = commands[t]
         mujoco.mj_fwdActuation(model, data)
-        mujoco.mju_sparse2dense(
-            moments, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind
-        )
         needed[t] = data.qfrc_inverse - idle
-        given[t] = moments.T * (data.actuator_force - idle_force)
+        given[t] = (moments(model, data) * (data.actuator_force - idle_force)[:, None])[drives].T
     return needed, given
 
 

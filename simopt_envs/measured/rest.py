@@ -5,7 +5,9 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
+from simopt_envs.measured.channels import commanded_actuators
 from simopt_envs.measured.resample import Array
+from simopt_envs.physics.effects.actuators import moments
 
 _FIXED = int(mujoco.mjtGain.mjGAIN_FIXED)
 _LINEAR = int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)
@@ -23,18 +25,14 @@ def holding_commands(model: mujoco.MjModel, qpos: Array, first: Array) -> Array:
     mujoco.mj_forward(model, data)
     data.qacc[:] = 0.0
     mujoco.mj_inverse(model, data)
-    moment = np.zeros((model.nu, model.nv))
-    mujoco.mju_sparse2dense(moment, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind)
-    needed = np.linalg.lstsq(moment.T, data.qfrc_inverse, rcond=None)[0]
-    gain = model.actuator_gainprm[:, 0]
-    bias = np.where(
-        model.actuator_biastype == _LINEAR[1],
-        model.actuator_biasprm[:, 0] + model.actuator_biasprm[:, 1] * data.actuator_length,
-        0.0,
-    )
+    drives, arms = commanded_actuators(model), moments(model, data)
+    others = np.setdiff1d(np.arange(len(arms)), drives)  # as cogging, which acts whatever is told
+    held = data.qfrc_inverse - arms[others].T @ data.actuator_force[others]
+    needed = np.linalg.lstsq(arms[drives].T, held, rcond=None)[0]
+    gain, offset, stiffness = model.actuator_gainprm[:, 0], model.actuator_biasprm[:, 0], model.actuator_biasprm[:, 1]
+    bias = np.where(model.actuator_biastype == _LINEAR[1], offset + stiffness * data.actuator_length, 0.0)[drives]
     told = (model.actuator_gaintype == _FIXED) & np.isin(model.actuator_biastype, _LINEAR) & (gain != 0)
     told &= model.actuator_dyntype != _INTEGRATES
-    limited = model.actuator_forcelimited.astype(bool)
-    low, high = model.actuator_forcerange.T
-    told &= ~limited | ((needed >= low) & (needed <= high))
-    return np.where(told, (needed - bias) / np.where(gain == 0, 1.0, gain), first)
+    low, high = model.actuator_forcerange[drives].T
+    enough = (model.actuator_forcelimited[drives] == 0) | ((needed >= low) & (needed <= high))
+    return np.where(told[drives] & enough, (needed - bias) / np.where(gain == 0, 1.0, gain)[drives], first)

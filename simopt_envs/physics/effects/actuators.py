@@ -58,13 +58,18 @@ def drive_unit(model: mujoco.MjModel, actuator: str) -> str:
     return "N" if joint is None else force_unit(model, joint)
 
 
+def moments(model: mujoco.MjModel, data: mujoco.MjData) -> Array:
+    """The moment arms by which the first output of each actuator acts on degrees of freedom, (nactuator, nv)."""
+    arms: Array = np.zeros((len(data.moment_rownnz), model.nv))
+    mujoco.mju_sparse2dense(arms, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind)
+    return arms[getattr(model, "actuator_outadr", slice(None))]  # one output each before MuJoCo 3.15
+
+
 def drive_force(model: mujoco.MjModel, actuator: str, motion: Motion) -> float:
     """Root mean square of the force of a drive [N, N m], from that of what it moves, times its :func:`gear`."""
     data = mujoco.MjData(model)
     mujoco.mj_fwdPosition(model, data)
-    arms: Array = np.zeros((len(data.moment_rownnz), model.nv))
-    mujoco.mju_sparse2dense(arms, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind)
-    arm = np.abs(arms[model.actuator_outadr[model.actuator(actuator).id]])
+    arm = np.abs(moments(model, data)[model.actuator(actuator).id])
     moved = arm > 0
     return float(np.max(motion.force[moved] / arm[moved], initial=0.0)) * abs(gear(model, actuator))
 
