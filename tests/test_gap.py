@@ -71,6 +71,26 @@ def test_a_right_model_with_wrong_plain_parameters_lacks_nothing():
     assert gap.errors.refit < 1.1 * gap.errors.noise_floor < gap.errors.before
 
 
+def test_a_model_that_was_repaired_is_searched_again_but_for_what_it_has():
+    repaired = spec()
+    EFFECTS["cogging"].add(repaired, "joint:shoulder")
+    (motor,) = (actuator for actuator in repaired.actuators if actuator.name == "shoulder.cogging")
+    motor.biasprm[:3] = 2.0, 8.0, 0.5
+    effects = [*FEW[:2], EFFECTS["cogging"]]
+
+    def law(q, v):
+        return np.array([2.0 * np.sin(8.0 * q[0] + 0.5), -0.4 * np.tanh(v[1] / 0.01)])
+
+    gap = find_gap(repaired, record(law, np.random.default_rng(1)), effects=effects)
+    (named,) = gap.effects
+    assert (named.candidate.effect.name, named.candidate.place) == ("coulomb_friction", "joint:elbow")
+    assert named.parameters["frictionloss"].value == pytest.approx(0.4, rel=0.05)
+    assert [w.message for w in gap.warnings if w.check == "effects"] == [
+        "the model has cogging at joint:shoulder already: not looked for again"
+    ]
+    assert gap.spec.compile().nactuator == 3
+
+
 def test_the_constant_force_of_a_drive_is_told_from_friction():
     recordings = record(lambda q, v: np.array([0.4, 0.0]), np.random.default_rng(3))
     gap = find_gap(spec(), recordings, effects=FEW)

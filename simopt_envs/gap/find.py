@@ -35,7 +35,7 @@ from simopt_envs.gap.wild_starts import of_linear_starts, without_wild_columns, 
 from simopt_envs.measured.channels import actuator_names, commanded_actuators
 from simopt_envs.measured.mapping import LogMapping
 from simopt_envs.measured.readers import load_recordings
-from simopt_envs.measured.recording import Recording
+from simopt_envs.measured.recording import Finding, Recording
 from simopt_envs.measured.windows import Windows
 from simopt_envs.physics.effects import EFFECTS, Effect, Motion, require_mujoco
 from simopt_envs.physics.effects.readings import columns
@@ -154,6 +154,8 @@ def solve(
     """What is missing, see :func:`find_gap`; ``null``, if it is there already, is what :func:`refitted` gives."""
     model, fitted = problem.plain.model, problem.data.fitted
     seen = tuple(c for effect in effects for c in _places(effect, model) if _shows(c, model, fitted))
+    there = [c for c in seen if _is_there(c, problem.given)]
+    seen = tuple(c for c in seen if c not in there)
     if not seen:
         raise ValueError("there is nothing to search: no effect can act in this model and show in its data")
     null = null or refitted(problem, progress)
@@ -177,8 +179,10 @@ def solve(
                 problem, kept = half, None if directory is None else Path(directory) / "half_the_timestep"
                 search, found = searched(problem, refitted(problem, progress), kept)
             elif half is not problem:
-                told = (*found.data.warnings, half.data.warnings[-1])
-                found = replace(found, data=replace(found.data, warnings=told))
+                found = _warned(found, half.data.warnings[-1])
+        if there:
+            message = f"the model has {', '.join(map(str, there))} already: not looked for again"
+            found = _warned(found, Finding.warning("", "effects", message))
         if judge(found) == "partly":
             final = of_best_length(found.final, found.data, search.fit, progress, problem.keyframe)
             found = replace(found, final=final)
@@ -266,6 +270,21 @@ def _spec(model: str | Path | mujoco.MjSpec) -> mujoco.MjSpec:
 
 def _places(effect: Effect, model: mujoco.MjModel) -> list[Candidate]:
     return [Candidate(effect, place) for place in effect.places(model)]
+
+
+def _warned(found: Explanation, warning: Finding) -> Explanation:
+    return replace(found, data=replace(found.data, warnings=(*found.data.warnings, warning)))
+
+
+def _is_there(candidate: Candidate, spec: mujoco.MjSpec) -> bool:
+    """Whether a model has been given an effect that adds elements, which would have names that are taken."""
+    try:
+        candidate.effect.add(spec.copy(), candidate.place)
+    except ValueError as error:
+        if "repeated name" in str(error):
+            return True
+        raise
+    return False
 
 
 def _shows(candidate: Candidate, model: mujoco.MjModel, windows: Windows) -> bool:
