@@ -7,6 +7,7 @@ import pytest
 from simopt_envs.physics import ModelWriter, Parameter, ParameterSpace, Write
 from simopt_envs.physics.columns import acts_on_columns
 from simopt_envs.physics.effects import EFFECTS, Motion
+from simopt_envs.physics.effects.actuator_saturation import UNLIMITED
 from simopt_envs.physics.effects.actuators import command_sources, on_all_parts
 
 Batch = pytest.importorskip("mujoco.batch", reason="effects need MuJoCo >= 3.17").Batch
@@ -223,6 +224,14 @@ def test_actuator_bias_is_a_force_behind_the_gear():
     close(rollout(with_effect("actuator_bias", {"force": 0.3}, "actuator:elbow")), rollout(plain(), commands), 1e-10)
 
 
+def test_actuator_bias_does_not_bring_in_a_bias_that_the_model_ignores():
+    ignored = XML.replace('<motor name="drive"', '<general biasprm="1 -50 -5" name="drive"')
+    close(
+        rollout(with_effect("actuator_bias", {"force": 2.0}, xml=ignored)),
+        rollout(with_effect("actuator_bias", {"force": 2.0})),
+    )
+
+
 def test_actuator_saturation_clips_behind_the_gear():
     limited = XML.replace('name="drive"', 'name="drive" forcerange="-.4 .4"')
     model = with_effect("actuator_saturation", {"limit": 2.0}, "actuator:drive")
@@ -239,6 +248,14 @@ def test_actuator_saturation_starts_at_the_limit_that_the_model_has():
     assert space["limit"].nominal == pytest.approx(2.0)
     model = with_effect("actuator_saturation", {"limit": 1.0}, "actuator:drive", limited)
     np.testing.assert_allclose(model.actuator("drive").forcerange, [-0.2, 0.15])
+
+
+def test_actuator_saturation_does_not_start_at_a_limit_that_is_not_in_force():
+    loose = XML.replace('name="drive"', 'name="drive" forcelimited="false" forcerange="-.1 .1"')
+    saturation = structured("actuator_saturation", "actuator:drive", loose)
+    assert space_of("actuator_saturation", "actuator:drive", saturation)["limit"].nominal == 5 * UNLIMITED
+    limited = [with_effect("actuator_saturation", {"limit": 2.0}, "actuator:drive", xml) for xml in (loose, XML)]
+    close(*map(rollout, limited), 1e-12)
 
 
 def test_small_limits_are_tried_where_a_servo_is_held_back():
@@ -273,6 +290,49 @@ def test_deadband_of_a_servo_is_of_its_error():
     found = rollout(with_effect("deadband", {"width": width}))[:, : model.nq]
     close(found, positions, 1e-9)
     assert np.abs(found - rollout(model)[:, : model.nq]).max() > 0.03
+
+
+@pytest.mark.parametrize("limit", [2.0, 1.0])
+def test_a_dead_band_leaves_the_limit_that_its_drive_has_or_is_given(limit):
+    """The force is clip(k dz(e), -L, L'), and a drive without a limit gets none."""
+    spec = mujoco.MjSpec.from_string(XML.replace('kp="15" kv="0.6"', 'kp="15" forcerange="-2 1.5"'))
+    for effect in ("actuator_saturation", "deadband"):
+        EFFECTS[effect].add(spec, "actuator:elbow")
+    model = spec.compile()
+    space = ParameterSpace(
+        p for e in ("actuator_saturation", "deadband") for p in EFFECTS[e].parameters(model, PLACES[e])
+    )
+    data = mujoco.MjData(model)
+    ModelWriter(model, space).write_model(space.values({"limit": limit, "width": 0.1}), model, data)
+    elbow = model.joint("elbow")
+    for error in np.linspace(-0.4, 0.4, 33):
+        data.ctrl[[1, 3]] = data.qpos[elbow.qposadr[0]] + error
+        mujoco.mj_forward(model, data)
+        force = np.clip(15 * dead_zone(error, 0.1), -limit, 0.75 * limit)
+        assert data.qfrc_actuator[elbow.dofadr[0]] == pytest.approx(force, abs=1e-9)
+    writes = [
+        w.object
+        for p in space_of("deadband", "actuator:elbow", structured("deadband", "actuator:elbow"))
+        for w in p.writes
+    ]
+    assert set(writes) == {"elbow.deadband"}
+
+
+def test_keyframes_command_both_actuators_of_a_drive_with_a_dead_band():
+    keys = '<keyframe><key name="up" ctrl=".1 .6 .2" act=".4 .5"/><key name="rest" qpos="0 .2 0 0"/></keyframe>'
+    filtered = XML.replace(' kp="40"', ' kp="40" timeconst=".1"').replace(' kp="15"', ' kp="15" timeconst=".1"')
+    spec = mujoco.MjSpec.from_string(filtered.replace("</mujoco>", f"{keys}</mujoco>"))
+    for place in ("actuator:elbow", "actuator:drive"):
+        EFFECTS["deadband"].add(spec, place)
+    for model in (spec.compile(), mujoco.MjModel.from_xml_string(spec.to_xml())):
+        close(model.key_ctrl, [[0.1, 0.6, 0.2, 0.6, 0.2], [0] * 5])
+        close(model.key_act, [[0.4, 0.5, 0.5], [0] * 3])
+
+
+def test_a_drive_without_a_gain_is_no_place_for_a_dead_band():
+    idle = '<general name="drive" joint="carriage" gainprm="0" biastype="affine" biasprm="0 -10 0"/>'
+    model = plain(XML.replace('<motor name="drive" joint="carriage" gear="5"/>', idle))
+    assert EFFECTS["deadband"].places(model) == ("actuator:shoulder", "actuator:elbow")
 
 
 def test_both_actuators_of_a_drive_with_a_dead_band_are_scaled_and_delayed():
@@ -321,6 +381,14 @@ def test_sensor_bias_of_an_encoder_moves_what_it_reads_and_nothing_else():
     assert expected[:, elbow].max() > 1.55
     expected[:, elbow] += bias
     close(rollout(biased, into_limit), expected, 1e-10)
+
+
+def test_sensor_bias_of_an_encoder_moves_tendons_without_a_name_too():
+    nameless = XML.replace('<fixed name="cable"', "<fixed")
+    bias = {"bias": 0.15}
+    close(rollout(with_effect("sensor_bias", bias, xml=nameless)), rollout(with_effect("sensor_bias", bias)), 0)
+    untouched = structured("sensor_bias", "joint:carriage", nameless)
+    assert untouched.tendon(0).name == ""
 
 
 def test_frame_offset_moves_the_site_in_its_body():

@@ -139,6 +139,9 @@ def test_places() -> None:
     model = mujoco.MjModel.from_xml_string(ARM)
     assert EFFECTS["cogging"].places(model) == ("joint:shoulder", "joint:elbow", "joint:drive")
     assert EFFECTS["joint_coupling"].places(model) == ("joint:shoulder+elbow",)
+    odd, place = ARM.replace('"shoulder"', '"a+b"').replace('"elbow"', '"c+"'), "joint:a+b+c+"
+    assert EFFECTS["joint_coupling"].places(mujoco.MjModel.from_xml_string(odd)) == (place,)
+    assert EFFECTS["joint_coupling"].probes(structure("joint_coupling", place, odd)[0], place, MOTION)
     explicit = mujoco.MjModel.from_xml_string(ARM.replace("implicitfast", "RK4"))
     assert EFFECTS["joint_elasticity"].places(model) == ("joint:shoulder", "joint:elbow", "joint:drive")
     assert EFFECTS["joint_elasticity"].places(explicit) == ()
@@ -318,6 +321,12 @@ LOADED = """
 </mujoco>
 """
 
+# The same: MuJoCo takes the first two bodies for one, and the joint is said in a frame within its body.
+FUSED = LOADED.replace("<option", '<compiler fusestatic="true"/><option')
+FRAMED = LOADED.replace(
+    '<joint name="hinge" type="hinge" axis="0 1 0" pos="-0.1 0 0" armature="0.02"/>',
+    '<frame pos="-0.1 0 0" euler="90 0 0"><joint name="hinge" axis="0 0 -1" armature="0.02"/></frame>',
+)
 
 CARRIAGE = """
 <mujoco>
@@ -340,6 +349,8 @@ CARRIAGE = """
     [
         (LOADED, "hinge", 0.02, 0.05),
         (LOADED, "hinge", 0.1, 0.4),  # at 13 rad/s
+        (FUSED, "hinge", 0.02, 0.05),
+        (FRAMED, "hinge", 0.02, 0.05),
         (CARRIAGE, "carriage", 0.003, 0.1),
         (CARRIAGE, "carriage", 0.1, 0.1),
     ],

@@ -5,7 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 import pytest
-from effect_arm import ARM, STEPS, TIMESTEP, with_effect
+from effect_arm import ARM, STEPS, TIMESTEP, structure, with_effect
 
 from simopt_envs.physics.effects import EFFECTS
 from simopt_envs.physics.effects.joints import on_bearing
@@ -83,6 +83,16 @@ def test_backlash_link_lies_still_on_a_stop() -> None:
         turns += int(abs(data.qpos[link.qposadr[0]]) > 0.0099 and speed * last < 0)
         last = speed
     assert turns < 60  # stops of impedance 0.9999 make it turn round 190 times
+
+
+@pytest.mark.parametrize(("effect", "link"), [("backlash", "play"), ("joint_elasticity", "link")])
+def test_a_link_turns_about_the_axis_of_a_joint_in_a_frame(effect: str, link: str) -> None:
+    joint = '<joint name="elbow" type="hinge" axis="0 1 0" ref="10" springref="20"/>'
+    framed = '<frame pos="0.1 0 0" euler="30 0 40">' + joint.replace("<joint", '<joint pos="0 0.2 0"') + "</frame>"
+    model, _ = structure(effect, "joint:elbow", ARM.replace(joint, framed))
+    motor, behind = model.joint("elbow"), model.joint(f"elbow.{link}")
+    assert np.abs(motor.axis - [0, 1, 0]).max() > 0.1
+    np.testing.assert_allclose([behind.axis, behind.pos], [motor.axis, motor.pos], atol=1e-12)
 
 
 def test_elasticity_and_backlash_can_be_in_series() -> None:

@@ -66,6 +66,16 @@ def test_an_actuator_that_takes_no_command_is_passed_over():
 
 
 @needs_effects
+def test_the_part_that_a_dead_band_adds_is_commanded_as_its_drive():
+    spec = mujoco.MjSpec.from_string(DRIVES.format('<motor name="hip" joint="hip"/><motor joint="wheel"/>'))
+    EFFECTS["deadband"].add(spec, "actuator:hip")
+    model = spec.compile()
+    assert actuator_names(model) == ["hip", "wheel", "hip"]
+    commands = [channel for channel in model_channels(model).values() if channel.kind == "ctrl"]
+    assert [(channel.name, channel.index) for channel in commands] == [("ctrl/hip", 0), ("ctrl/wheel", 1)]
+
+
+@needs_effects
 def test_from_episodes_of_gymnasiums_reacher_to_its_repair(tmp_path, monkeypatch, capsys):
     """Its actuators have no names, and its model lacks the friction that the recorded one has in its second joint."""
     monkeypatch.setattr("simopt_envs.gap.find_gap", partial(find_gap, effects=FEW))

@@ -39,6 +39,8 @@ def test_commands_arrive_late_by_the_delay_and_spread_by_the_lag(share):
     assert answer.sum() == pytest.approx(1.0)
     assert answer @ age == pytest.approx(delay)
     assert np.sqrt(answer @ (age - delay) ** 2) == pytest.approx(share * delay, rel=0.02, abs=1e-9)
+    with pytest.raises(ValueError, match="unknown commanded actuator 'elbow'; did you mean 'elbows'"):
+        CommandModel(space_of("actuator_delay", "actuator:elbow"), ["elbows"])
 
 
 @pytest.mark.parametrize("share", [0.0, 0.4, 1.0])

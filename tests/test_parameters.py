@@ -1,10 +1,14 @@
 """Parameter, ParameterSpace and ModelWriter."""
 
+from functools import partial
+
 import mujoco
 import numpy as np
 import pytest
+from conftest import needs_effects
 
 from simopt_envs.physics import ModelWriter, Parameter, ParameterSpace, Write
+from simopt_envs.physics.simulation import BatchSimulation, SingleSimulation
 
 XML = """
 <mujoco>
@@ -95,6 +99,12 @@ def test_bad_values_are_named(named, message):
         SPACE.values(named)
 
 
+def test_an_infinite_bound_allows_no_infinite_value():
+    space = ParameterSpace([Parameter("stiffness", "N/m", 1.0, 0.0, np.inf, "linear")])
+    with pytest.raises(ValueError, match="'stiffness' is not finite"):
+        space.values({"stiffness": np.inf})
+
+
 @pytest.mark.parametrize(
     "wrong",
     [
@@ -121,6 +131,7 @@ def test_names_are_unique():
         (Write("geom_size", "bix"), "Valid names: box, rod"),
         (Write("dof_damping"), "needs the name of the object"),
         (Write("body_pos", "cart", (3,)), "index"),
+        (Write("opt.gravity", index=(3,)), "opt.gravity has 3 columns, index"),
     ],
 )
 def test_writes_to_places_that_do_not_exist_are_refused(write, message):
@@ -184,6 +195,41 @@ def test_operations_on_one_place_compose_from_the_nominal():
     )
     ModelWriter(model, space).write_model(np.array([0.5, 0.4, 3.0]), model, data)
     assert model.body("cart").mass[0] == pytest.approx(3.0 * (0.4 / 0.2) ** 2 * 3.0 + 0.5, rel=1e-12)
+
+
+@needs_effects
+def test_fields_of_actuators_with_several_commands_and_outputs_are_written_where_they_are():
+    before = '<actuator><orientation name="wrist" joint="ball" kp="3"/>'
+    ball = '<body><joint name="ball" type="ball"/><geom size="0.1"/></body></worldbody>'
+    servo = 'kp="10" gear="2" ctrlrange="-1 1" forcerange="-3 3"'
+    xml = XML.replace("</worldbody>", ball).replace("<actuator>", before).replace('kp="10"', servo)
+    model = mujoco.MjModel.from_xml_string(xml)
+    assert (model.nu, model.nactuator) == (4, 2)
+    fields = ("actuator_gear", "actuator_ctrlrange", "actuator_forcerange")
+    for field in fields:
+        write = Write(field, "servo", operation="scale")
+        space = ParameterSpace([Parameter("twice", "1", 1.0, 0.1, 2.0, writes=(write,))])
+        ModelWriter(model, space).write_model(np.array([2.0]), model, mujoco.MjData(model))
+    truth = mujoco.MjModel.from_xml_string(xml.replace(servo, 'kp="10" gear="4" ctrlrange="-2 2" forcerange="-6 6"'))
+    for field in fields:
+        np.testing.assert_array_equal(getattr(model, field), getattr(truth, field), err_msg=field)
+
+
+@needs_effects
+def test_delayed_drives_of_several_commands_start_from_their_first_ones():
+    """As if they had always held: as without the delays."""
+    pid = '<actuator><pid name="rod" joint="hinge" kp="5" kv="1" delay="0.01" nsample="8"/>'
+    late = XML.replace("<actuator>", pid).replace('kp="10"', 'kp="10" delay="0.01" nsample="8"')
+    ends, command = [], np.array([[0.2, -0.1, 0.4]])
+    for xml in (late, late.replace('delay="0.01" nsample="8"', "")):
+        model = mujoco.MjModel.from_xml_string(xml)
+        for engine in (SingleSimulation, partial(BatchSimulation, num_worlds=1)):
+            simulation = engine(model, ParameterSpace(()))
+            simulation.reset(np.array([0]), np.zeros((1, 2)), np.zeros((1, 2)), command)
+            simulation.step(command, 10)
+            ends.append(simulation.data("qpos")[0].copy())
+    assert np.abs(ends[0]).min() > 5e-5
+    np.testing.assert_allclose(ends, [ends[0]] * 4, rtol=1e-12)
 
 
 def test_two_setters_of_one_place_are_refused():

@@ -84,6 +84,15 @@ def test_commands_that_hold_are_those_of_the_weight_in_servos_and_of_others_the_
 
 
 @needs_effects
+def test_a_drive_with_a_dead_band_holds_by_one_command():
+    spec = mujoco.MjSpec.from_string(HUNG)
+    EFFECTS["deadband"].add(spec, "actuator:arm")
+    held = holding_commands(spec.compile(), HELD, np.full(3, np.nan))
+    weight = 1.0 * 9.81 * 0.3 * np.cos(HELD[0])
+    assert held == pytest.approx([HELD[0] + weight / 200, 0.0, HELD[0] + weight / 200], abs=1e-9)
+
+
+@needs_effects
 def test_drives_hold_against_actuators_that_take_no_command():
     """As a repaired model has them, here before a drive, which is held back by a dead time."""
     spec = mujoco.MjSpec.from_string(HUNG.replace('<motor name="cart" joint="cart"/>', ""))

@@ -19,7 +19,11 @@ _KINDS = {  # first word of a quantity -> kind of object, its MuJoCo type, how m
     "jnt": ("joint", mujoco.mjtObj.mjOBJ_JOINT, "njnt"),
     "geom": ("geom", mujoco.mjtObj.mjOBJ_GEOM, "ngeom"),
     "tendon": ("tendon", mujoco.mjtObj.mjOBJ_TENDON, "ntendon"),
-    "actuator": ("actuator", mujoco.mjtObj.mjOBJ_ACTUATOR, "nu"),
+    "actuator": (
+        "actuator",
+        mujoco.mjtObj.mjOBJ_ACTUATOR,
+        "nactuator" if hasattr(mujoco.MjModel, "nactuator") else "nu",
+    ),
 }
 
 

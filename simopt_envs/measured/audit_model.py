@@ -8,7 +8,13 @@ import mujoco
 import numpy as np
 from scipy import signal
 
-from simopt_envs.measured.channels import Channel, actuator_names, commanded_actuators, model_channels
+from simopt_envs.measured.channels import (
+    SCALAR_JOINTS,
+    Channel,
+    actuator_names,
+    commanded_actuators,
+    model_channels,
+)
 from simopt_envs.measured.recording import Finding, Recording
 from simopt_envs.measured.resample import Array
 from simopt_envs.measured.smoothing import Smoothed, smooth
@@ -110,7 +116,7 @@ def _speed(recording: Recording, channel: Channel) -> float:
 def _motion(recording: Recording, model: mujoco.MjModel, channels: list[Channel]) -> Iterator[Finding]:
     """Velocities against derivatives of positions, and commands against the torques that the motion needed."""
     grid = recording.resample(recording.period)
-    scalar = [c for c in channels if c.kind == "qpos" and c.unit in ("rad", "m")]
+    scalar = [c for c in channels if c.kind == "qpos" and model.jnt_type[c.object] in SCALAR_JOINTS]
     if any(np.isfinite(grid[c.name]).sum() < LEAST_SAMPLES for c in channels):
         return
     joints = {c.object: smooth(grid[c.name], grid.period) for c in scalar}
@@ -118,7 +124,7 @@ def _motion(recording: Recording, model: mujoco.MjModel, channels: list[Channel]
         if channel.kind == "qvel" and channel.object in joints:
             yield from _velocity(grid, model, channel, joints)
     everything_known = len(joints) == model.nv == model.njnt and not (model.na or model.nhistory)
-    commanded = {c.object for c in channels if c.kind == "ctrl"} == set(range(model.nu))
+    commanded = {f"ctrl/{name}" for name in actuator_names(model)} <= {c.name for c in channels}
     if model.nu and everything_known and commanded:
         yield from _commands(grid, model, joints)
 
@@ -175,15 +181,16 @@ def _commands(grid: Recording, model: mujoco.MjModel, joints: dict[int, Smoothed
     needed, given = _torques(grid, model, joints)
     usable = np.isfinite(needed).all(axis=1) & np.isfinite(given).all(axis=(1, 2))
     edge = round(1 / (COMMAND_BAND * grid.period))  # where the filter has not seen a whole cycle
-    if not usable.all() or edge < 2 or len(grid) < 6 * edge:
+    cut_off = 2 * COMMAND_BAND * grid.period
+    if not usable.all() or cut_off >= 1 or len(grid) < 6 * edge:
         return  # a filter cannot run across holes, nor be judged on a few cycles
-    low_pass = signal.butter(4, 2 * COMMAND_BAND * grid.period, output="sos")
+    low_pass = signal.butter(4, cut_off, output="sos")
     stride = max(1, edge // 40)
 
     def slow(values: Array) -> Array:
         return signal.sosfiltfilt(low_pass, values, axis=0)[edge:-edge:stride]
 
-    period, commands = stride * grid.period, [f"ctrl/{name}" for name in actuator_names(model)]
+    period, commands = stride * grid.period, _command_columns(model)
     for dof in range(model.nv):
         joint = int(model.dof_jntid[dof])
         velocity = joints[joint].velocity
@@ -197,7 +204,7 @@ def _commands(grid: Recording, model: mujoco.MjModel, joints: dict[int, Smoothed
             still = _partial_correlation(want, have, nuisance)
             correlation, lag = _best_lag(want, have, period, nuisance)
             yield from _command(name, model.joint(joint).name, want, have, (still, correlation, lag, grid.period))
-            for other in set(range(model.nu)) - {int(actuator)} if still < COMMAND_ALIKE else ():
+            for other in set(range(len(commands))) - {int(actuator)} if still < COMMAND_ALIKE else ():
                 foreign = slow(grid[commands[other]])
                 alike = _partial_correlation(want, foreign, nuisance)
                 if alike > COMMAND_ALIKE and (1 - still**2) > COMMAND_CLEARER * (1 - alike**2):
@@ -231,14 +238,20 @@ def _command(
             )
 
 
+def _command_columns(model: mujoco.MjModel) -> list[str]:
+    """The columns of commands, each once: a drive with a dead band has two actuators."""
+    return list(dict.fromkeys(f"ctrl/{name}" for name in actuator_names(model)))
+
+
 def _torques(grid: Recording, model: mujoco.MjModel, joints: dict[int, Smoothed]) -> tuple[Array, Array]:
-    """Generalised forces that the motion needed, (T, nv), and that each command gave, (T, nv, nu)."""
+    """Generalised forces that the motion needed, (T, nv), and that each command column gave, (T, nv, c)."""
     data = mujoco.MjData(model)
     order = [joints[int(model.dof_jntid[dof])] for dof in range(model.nv)]
     state = [np.stack([getattr(s, what) for s in order], axis=1) for what in ("value", "velocity", "acceleration")]
-    commands = np.stack([grid[f"ctrl/{name}"] for name in actuator_names(model)], axis=1)
-    needed, given = np.full((len(grid), model.nv), np.nan), np.zeros((len(grid), model.nv, model.nu))
-    drives = commanded_actuators(model)
+    columns, names = _command_columns(model), [f"ctrl/{name}" for name in actuator_names(model)]
+    commands = np.stack([grid[name] for name in names], axis=1)
+    needed, given = np.full((len(grid), model.nv), np.nan), np.zeros((len(grid), model.nv, len(columns)))
+    drives, parts = commanded_actuators(model), np.array([[name == column for column in columns] for name in names])
     for t in np.flatnonzero(np.isfinite(np.concatenate(state, axis=1)).all(axis=1)):
         data.qpos[:], data.qvel[:], data.qacc[:] = (part[t] for part in state)
         data.ctrl[:] = 0
@@ -248,7 +261,7 @@ def _torques(grid: Recording, model: mujoco.MjModel, joints: dict[int, Smoothed]
         data.ctrl[:] = commands[t]
         mujoco.mj_fwdActuation(model, data)
         needed[t] = data.qfrc_inverse - idle
-        given[t] = (moments(model, data) * (data.actuator_force - idle_force)[:, None])[drives].T
+        given[t] = (moments(model, data) * (data.actuator_force - idle_force)[:, None])[drives].T @ parts
     return needed, given
 
 

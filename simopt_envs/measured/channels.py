@@ -9,6 +9,8 @@ import mujoco
 import numpy as np
 
 from simopt_envs.measured.resample import Array
+from simopt_envs.physics.effects.actuators import command_sources
+from simopt_envs.physics.writer import actuator_rows
 
 Kind = Literal["ctrl", "qpos", "qvel", "sensordata", "site_xpos"]
 
@@ -31,6 +33,9 @@ class Channel:
     object: int
     unit: str
 
+
+SCALAR_JOINTS = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE))
+"""Those whose one number's rate is their velocity."""
 
 _SENSOR_UNITS = {
     mujoco.mjtSensor.mjSENS_JOINTVEL: "rad/s",
@@ -60,7 +65,7 @@ def commanded_actuators(model: mujoco.MjModel) -> list[int]:
     Raises:
         ValueError: if an actuator takes several commands, as ``<pid>`` can.
     """
-    takes = getattr(model, "actuator_ctrlnum", np.ones(model.nu, dtype=np.int32))  # one each before MuJoCo 3.15
+    _, takes = actuator_rows(model, "ctrl")
     if several := np.flatnonzero(takes > 1).tolist():
         raise ValueError(
             f"actuator {model.actuator(several[0]).name or several[0]!r} takes {takes[several[0]]} commands, "
@@ -73,6 +78,7 @@ def actuator_names(model: mujoco.MjModel) -> list[str]:
     """What each command (nu,) is called in recordings: as its actuator, see :func:`commanded_actuators`.
 
     One without a name, as most of Gymnasium's, has that of what it acts on, where no other actuator has it; else "".
+    The part that a dead band adds to a drive has the drive's, as it gets its command.
     """
     drives = commanded_actuators(model)
     given = [model.actuator(i).name for i in drives]
@@ -81,7 +87,8 @@ def actuator_names(model: mujoco.MjModel) -> list[str]:
     acts_on = [mujoco.mj_id2name(model, kind, i) or "" for kind, i in zip(kinds, targets, strict=True)]
     nameless = [target for name, target in zip(given, acts_on, strict=True) if not name]
     taken = {*given, *(target for target in nameless if nameless.count(target) > 1)}
-    return [name or ("" if target in taken else target) for name, target in zip(given, acts_on, strict=True)]
+    names = [name or ("" if target in taken else target) for name, target in zip(given, acts_on, strict=True)]
+    return [names[source] for source in command_sources(model)]
 
 
 def model_channels(model: mujoco.MjModel) -> dict[str, Channel]:
@@ -97,8 +104,9 @@ def model_channels(model: mujoco.MjModel) -> dict[str, Channel]:
             name = prefix if count == 1 else f"{prefix}/{k}"
             channels.append(Channel(name, kind, start + k, object_id, units[min(k, len(units) - 1)]))
 
-    for i, name in enumerate(actuator_names(model)):
-        if name:
+    commands = actuator_names(model)
+    for i, name in enumerate(commands):
+        if name and commands.index(name) == i:
             add(f"ctrl/{name}", "ctrl", i, i, 1, ("",))
     for i in range(model.njnt):
         if name := model.joint(i).name:

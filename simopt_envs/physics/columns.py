@@ -17,7 +17,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 
-from simopt_envs.physics.parameters import Array, Parameter, ParameterSpace
+from simopt_envs.physics.parameters import Array, Parameter, ParameterSpace, unknown_name
 
 _OUTSIDE = ("column.", "command.", "clock.")
 _NEUTRAL = {"column.bias": 0.0, "column.scale": 1.0, "column.delay": 0.0, "column.lag_share": 0.0}
@@ -93,15 +93,21 @@ class CommandModel:
     Args:
         space: parameters; those that write neither ``command.delay`` nor ``command.lag_share`` do nothing here.
         actuators: names of the commanded actuators, nu of them.
+
+    Raises:
+        ValueError: if a parameter writes the commands of another.
     """
 
     def __init__(self, space: ParameterSpace, actuators: Sequence[str]):
-        self._places = [
-            (write.field, actuators.index(write.object), i)
+        delays = [
+            (write, i)
             for i, parameter in enumerate(space)
             for write in parameter.writes
             if write.field in ("command.delay", "command.lag_share") and write.object is not None
         ]
+        if unknown := [write.object for write, _ in delays if write.object not in actuators]:
+            raise ValueError(unknown_name("commanded actuator", unknown[0], actuators))
+        self._places = [(write.field, actuators.index(write.object), i) for write, i in delays]
         self._count = len(actuators)
 
     def delays(self, xi: Array) -> Array:

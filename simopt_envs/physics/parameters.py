@@ -161,7 +161,7 @@ class ParameterSpace:
     def validate(self, x: ArrayLike) -> Array:
         """The values as an array; ValueError naming the first that is not finite or out of bounds."""
         x = self._last_axis(x, "values")
-        wrong = ~((x >= self.low) & (x <= self.high))  # also True for NaN
+        wrong = ~(np.isfinite(x) & (x >= self.low) & (x <= self.high))
         if wrong.any():
             where = tuple(np.argwhere(wrong)[0])
             p, value = self.parameters[where[-1]], x[where]

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from simopt_envs.physics.parameters import Array, ParameterSpace
 from simopt_envs.physics.profiler import PROFILER_RESTS
-from simopt_envs.physics.writer import ModelWriter, model_field
+from simopt_envs.physics.writer import ModelWriter, actuator_rows, model_field
 
 _POSITIONS = int(mujoco.mjtStage.mjSTAGE_POS)
 _DIVERGED = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
@@ -220,16 +220,17 @@ class CommandHistory:
     """
 
     def __init__(self, model: mujoco.MjModel):
-        # A buffer is [user slot, cursor, n times, n values].
+        # A buffer is [user slot, cursor, n times, n times the actuator's commands].
+        lengths = np.ravel(model.actuator_history[:, 0])
+        buffers = zip(model.actuator_historyadr, lengths, *actuator_rows(model, "ctrl"), strict=True)
         self._slots = [
-            (i, int(adr) + 2 + int(n), int(n))
-            for i, (adr, n) in enumerate(
-                zip(model.actuator_historyadr, np.ravel(model.actuator_history[:, 0]), strict=True)
-            )
+            (int(first) + k, slice(int(adr + 2 + n) + k, int(adr + 2 + n + n * count), int(count)))
+            for adr, n, first, count in buffers
             if n > 0
+            for k in range(count)
         ]
 
     def fill(self, history: Any, ctrl: Any) -> None:
         """Write ``ctrl`` (k, nu) as every past command into ``history`` (k, nhistory), in place."""
-        for actuator, start, n in self._slots:
-            history[:, start : start + n] = ctrl[:, actuator, None]
+        for command, past in self._slots:
+            history[:, past] = ctrl[:, command, None]

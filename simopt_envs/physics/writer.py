@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Literal
 
 import mujoco
 import numpy as np
@@ -35,9 +36,14 @@ _COUNT = {
     mujoco.mjtObj.mjOBJ_PAIR: "npair",
     mujoco.mjtObj.mjOBJ_EQUALITY: "neq",
     mujoco.mjtObj.mjOBJ_TENDON: "ntendon",
-    mujoco.mjtObj.mjOBJ_ACTUATOR: "nu",
+    mujoco.mjtObj.mjOBJ_ACTUATOR: "nactuator" if hasattr(mujoco.MjModel, "nactuator") else "nu",
     mujoco.mjtObj.mjOBJ_SENSOR: "nsensor",
     mujoco.mjtObj.mjOBJ_NUMERIC: "nnumeric",
+}
+# Fields of actuators with a row for each command or output, where the others have one for each actuator.
+_OF_SEVERAL: dict[str, Literal["ctrl", "out"]] = {
+    **dict.fromkeys(("actuator_ctrllimited", "actuator_ctrlrange"), "ctrl"),
+    **dict.fromkeys(("actuator_acc0", "actuator_gear", "actuator_length0", "actuator_lengthrange"), "out"),
 }
 # MuJoCo lists the fields that mj_setConst reads from 4.0 on; before that it is run after every write.
 _SETCONST_INPUTS: frozenset[str] | None = (
@@ -130,6 +136,13 @@ def model_field(model: mujoco.MjModel, field: str) -> np.ndarray:
     return array
 
 
+def actuator_rows(model: mujoco.MjModel, what: Literal["ctrl", "out"]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Of each actuator's commands or outputs the first, and how many there are; one each in older MuJoCo."""
+    first = getattr(model, f"actuator_{what}adr", np.arange(model.nu))
+    count = getattr(model, f"actuator_{what}num", np.ones(model.nu))
+    return first.astype(np.intp), count.astype(np.intp)
+
+
 def field_elements(model: mujoco.MjModel, write: Write) -> NDArray[np.intp]:
     """Flat positions, within its field, of the elements that a write touches.
 
@@ -138,17 +151,16 @@ def field_elements(model: mujoco.MjModel, write: Write) -> NDArray[np.intp]:
     """
     array = model_field(model, write.field)
     if write.field.startswith("opt."):
-        positions = np.arange(array.size)
-        return positions if write.index is None else positions[list(write.index)]
-    rows = np.arange(array.size).reshape(array.shape[0], -1)[_object_rows(model, write)]
+        rows = np.arange(array.size)[None]
+    else:
+        rows = np.arange(array.size).reshape(array.shape[0], -1)[_object_rows(model, write)]
     if write.index is None:
         return rows.ravel()
     # A scalar field of a joint or numeric spans rows, not columns: the index then picks among the rows.
     rows = rows.T if rows.shape[1] == 1 else rows
     if max(write.index) >= rows.shape[1]:
-        raise ValueError(
-            f"{write.field} of {write.object!r} has {rows.shape[1]} columns, index {write.index} is outside"
-        )
+        owner = "" if write.object is None else f" of {write.object!r}"
+        raise ValueError(f"{write.field}{owner} has {rows.shape[1]} columns, index {write.index} is outside")
     return rows[:, list(write.index)].ravel()
 
 
@@ -171,6 +183,9 @@ def _object_rows(model: mujoco.MjModel, write: Write) -> slice:
     elif kind == "numeric" and write.field == "numeric_data":
         start = int(model.numeric_adr[i])
         end = start + int(model.numeric_size[i])
+    elif write.field in _OF_SEVERAL:
+        first, count = actuator_rows(model, _OF_SEVERAL[write.field])
+        start, end = int(first[i]), int(first[i] + count[i])
     else:
         start, end = i, i + 1
     return slice(start, end)

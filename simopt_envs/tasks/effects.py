@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
-from simopt_envs.physics.effects import EFFECTS, Effect, object_name, require_mujoco
+from simopt_envs.physics.effects import EFFECTS, Effect, require_mujoco
 from simopt_envs.physics.effects.actuator_delay import LONGEST
 from simopt_envs.physics.parameters import Parameter, Write, unknown_name
 
@@ -88,7 +88,7 @@ def _parameters(effect: Effect, model: mujoco.MjModel, place: str, values: Mappi
             continue
         yield replace(
             p,
-            name=f"{effect.name}.{object_name(place)}.{p.name}",
+            name=effect.full_name(place, p.name),
             nominal=float(values.get(p.name, p.nominal)),
             baseline=p.nominal,
             writes=tuple(map(_native, p.writes)),

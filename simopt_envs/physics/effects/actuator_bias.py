@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import mujoco
+import numpy as np
 
 from simopt_envs.physics.effects.actuators import affine_drives, drive_force, drive_unit, gear
 from simopt_envs.physics.effects.effect import Effect, Motion, object_name
@@ -21,7 +22,9 @@ class ActuatorBias(Effect):
 
     def add(self, spec: mujoco.MjSpec, place: str) -> None:
         """See :meth:`Effect.add`."""
-        spec.actuator(object_name(place)).biastype = mujoco.mjtBias.mjBIAS_AFFINE
+        drive = spec.actuator(object_name(place))
+        if drive.biastype == mujoco.mjtBias.mjBIAS_NONE:
+            drive.biastype, drive.biasprm = mujoco.mjtBias.mjBIAS_AFFINE, np.zeros_like(drive.biasprm)
 
     def parameters(self, model: mujoco.MjModel, place: str) -> tuple[Parameter, ...]:
         """See :meth:`Effect.parameters`."""

@@ -29,8 +29,8 @@ class ActuatorSaturation(Effect):
 
     def add(self, spec: mujoco.MjSpec, place: str) -> None:
         """See :meth:`Effect.add`."""
-        drive = spec.actuator(object_name(place))
-        if not np.any(drive.forcerange):
+        drive, model = spec.actuator(object_name(place)), spec.copy().compile()
+        if not model.actuator(drive.name).forcelimited[0]:
             drive.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
             drive.forcerange = (-UNLIMITED, UNLIMITED)
 

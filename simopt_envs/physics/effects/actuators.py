@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from simopt_envs.physics.effects.effect import Motion, object_name
 from simopt_envs.physics.effects.joints import force_unit, scalar_joints
 from simopt_envs.physics.parameters import Array, Parameter
+from simopt_envs.physics.writer import actuator_rows
 
 DEADBAND = ".deadband"
 """What the name of the second actuator of a drive with a dead band ends in."""
@@ -23,7 +24,7 @@ _AFFINE_BIASES = (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFF
 
 def actuators(model: mujoco.MjModel) -> tuple[str, ...]:
     """``"actuator:NAME"`` of every named actuator with one command, less those that a dead band adds."""
-    drives = (model.actuator(int(i)).name for i in np.flatnonzero(model.actuator_ctrlnum == 1))
+    drives = (model.actuator(int(i)).name for i in np.flatnonzero(actuator_rows(model, "ctrl")[1] == 1))
     return tuple(f"actuator:{name}" for name in drives if name and not name.endswith(DEADBAND))
 
 
@@ -62,7 +63,7 @@ def moments(model: mujoco.MjModel, data: mujoco.MjData) -> Array:
     """The moment arms by which the first output of each actuator acts on degrees of freedom, (nactuator, nv)."""
     arms: Array = np.zeros((len(data.moment_rownnz), model.nv))
     mujoco.mju_sparse2dense(arms, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind)
-    return arms[getattr(model, "actuator_outadr", slice(None))]  # one output each before MuJoCo 3.15
+    return arms[actuator_rows(model, "out")[0]]
 
 
 def drive_force(model: mujoco.MjModel, actuator: str, motion: Motion) -> float:
@@ -76,10 +77,10 @@ def drive_force(model: mujoco.MjModel, actuator: str, motion: Motion) -> float:
 
 def command_sources(model: mujoco.MjModel) -> NDArray[np.intp]:
     """Whose command each control is, (nu,): the part that a dead band adds gets that of its drive."""
-    sources = np.arange(model.nu)
+    sources, (first, _) = np.arange(model.nu), actuator_rows(model, "ctrl")
     for drive in map(object_name, actuators(model)):
         if (part := _added_part(model, drive)) is not None:
-            own, added = (model.actuator_ctrladr[model.actuator(name).id] for name in (drive, part))
+            own, added = (first[model.actuator(name).id] for name in (drive, part))
             sources[added] = own
     return sources
 

@@ -18,7 +18,8 @@ _HELD = 0.95  # impedance of a stop: nearer to 1 it gives less under load, but c
 class Backlash(Effect):
     """A link that is loose against the motor of its joint, where the encoder is, by a total width ``play``.
 
-    Between the stops of the joint ``NAME.play``, nothing acts; the stops do not bounce.
+    Between the stops of the joint ``NAME.play``, nothing acts; the stops do not bounce. The joint's own spring and
+    stops stay on the motor's side, which the encoder sees.
     """
 
     name = "backlash"

@@ -26,7 +26,8 @@ class Deadband(Effect):
     actuator, ``NAME.deadband``, pulls against the drive with the same stiffness and a force limit of stiffness times
     width. It has to get the drive's command (:func:`~simopt_envs.physics.effects.actuators.command_sources`), and what
     scales or delays the drive must do the same to it (:func:`~simopt_envs.physics.effects.actuators.on_all_parts`).
-    The damping of a position servo stays.
+    Where the drive's own force is limited, its limit grows by as much as is pulled against it, so that the force of
+    both ends where the drive's did. The damping of a position servo stays.
     """
 
     name = "deadband"
@@ -34,28 +35,29 @@ class Deadband(Effect):
 
     def places(self, model: mujoco.MjModel) -> tuple[str, ...]:
         """See :meth:`Effect.places`."""
-        return tuple(
-            place
-            for place in affine_drives(model)
-            if model.actuator(object_name(place)).gaintype[0] == int(mujoco.mjtGain.mjGAIN_FIXED)
-        )
+        drives = ((place, model.actuator(object_name(place))) for place in affine_drives(model))
+        fixed = int(mujoco.mjtGain.mjGAIN_FIXED)
+        return tuple(place for place, drive in drives if drive.gaintype[0] == fixed and drive.gainprm[0] != 0)
 
     def add(self, spec: mujoco.MjSpec, place: str) -> None:
         """See :meth:`Effect.add`."""
-        drive = spec.actuator(object_name(place))
+        drive, model = spec.actuator(object_name(place)), spec.copy().compile()
         second = spec.add_actuator(name=drive.name + DEADBAND)
         for attribute in _SHARED:
             setattr(second, attribute, getattr(drive, attribute))
         second.gainprm, second.biasprm = -drive.gainprm, -_error_terms(drive.gainprm, drive.biasprm)
         second.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
         second.forcerange = (-_CLOSED, _CLOSED)
+        _tell_keyframes(spec, model, model.actuator(drive.name).id)
 
     def parameters(self, model: mujoco.MjModel, place: str) -> tuple[Parameter, ...]:
         """See :meth:`Effect.parameters`."""
         drive = object_name(place)
         stiffness = abs(float(model.actuator(drive).gainprm[0]))
+        limited = [drive + DEADBAND, *([drive] if model.actuator(drive).forcelimited[0] else [])]
         writes = tuple(
-            Write("actuator_forcerange", drive + DEADBAND, (side,), "add", factor=sign * stiffness)
+            Write("actuator_forcerange", name, (side,), "add", factor=sign * stiffness)
+            for name in limited
             for side, sign in enumerate((-1.0, 1.0))
         )
         return (Parameter("width", _unit(model, drive), 0.0, 0.0, 1e6, "linear", writes),)
@@ -66,6 +68,16 @@ class Deadband(Effect):
         stiffness = abs(float(model.actuator(drive).gainprm[0]) * gear(model, drive))
         error = drive_force(model, drive, motion) / stiffness
         return ({"width": 0.1 * error}, {"width": 0.5 * error})
+
+
+def _tell_keyframes(spec: mujoco.MjSpec, model: mujoco.MjModel, drive: int) -> None:
+    """Give the command and activation that keyframes have for a drive to the actuator that was added to its model."""
+    commanded, active = model.actuator_ctrladr[drive], model.actuator_actadr[drive]
+    for key, ctrl, act in zip(spec.keys, model.key_ctrl, model.key_act, strict=True):
+        if len(key.ctrl):
+            key.ctrl = np.append(ctrl, ctrl[commanded])
+        if len(key.act):
+            key.act = np.append(act, act[active : active + model.actuator_actnum[drive]])
 
 
 def _error_terms(gain: np.ndarray, bias: np.ndarray) -> np.ndarray:

@@ -76,6 +76,15 @@ class Effect(ABC):
         :mod:`simopt_envs.physics.columns`.
         """
 
+    def full_name(self, place: str, parameter: str) -> str:
+        """What one of its parameters is called in ξ: ``"coulomb_friction.elbow.frictionloss"``.
+
+        Of a reading with the kind of its place, ``"sensor_delay.site.tip.delay"``: a joint, a sensor and a site may
+        have one name.
+        """
+        where = place.replace(":", ".", 1) if self.of_reading else object_name(place)
+        return f"{self.name}.{where}.{parameter}"
+
     @abstractmethod
     def probes(self, model: mujoco.MjModel, place: str, motion: Motion) -> tuple[dict[str, float], ...]:
         """Values at which to try the effect first: sizes that would just show, one for each shape it may have.

@@ -38,23 +38,29 @@ class JointCoupling(Effect):
 
     def add(self, spec: mujoco.MjSpec, place: str) -> None:
         """See :meth:`Effect.add`."""
-        a, b = object_name(place).split("+")
         model = spec.copy().compile()
+        a, b = _joints(model, place)
         add_fixed_tendon(spec, f"{a}+{b}", a, b).springlength = [reference(model, a) + reference(model, b)] * 2
 
     def parameters(self, model: mujoco.MjModel, place: str) -> tuple[Parameter, ...]:
         """See :meth:`Effect.parameters`."""
-        pair = object_name(place)
-        unit = stiffness_unit(model, pair.split("+")[0])
-        write = Write("tendon_stiffness", pair, operation="add")
+        unit = stiffness_unit(model, _joints(model, place)[0])
+        write = Write("tendon_stiffness", object_name(place), operation="add")
         return (Parameter("stiffness", unit, 0.0, 0.0, 1e5, "linear", (write,)),)
 
     def probes(self, model: mujoco.MjModel, place: str, motion: Motion) -> tuple[dict[str, float], ...]:
         """See :meth:`Effect.probes`."""
-        pair = object_name(place).split("+")
+        pair = _joints(model, place)
         force = min(probe_force(model, joint, motion) for joint in pair)
         stretch = sum(float(motion.high[i] - motion.low[i]) for i in (dof(model, joint) for joint in pair))
         return ({"stiffness": force / stretch},)
+
+
+def _joints(model: mujoco.MjModel, place: str) -> tuple[str, str]:
+    """The two joints of a place; their own names may have a "+" too."""
+    pair, known = object_name(place), set(map(object_name, scalar_joints(model)))
+    splits = ((pair[:i], pair[i + 1 :]) for i, letter in enumerate(pair) if letter == "+")
+    return next(split for split in splits if known.issuperset(split))
 
 
 def _inner(model: mujoco.MjModel, joint: str) -> int:

@@ -23,6 +23,8 @@ _RIGID = 1e3  # stiffness that counts as infinite, in units of inertia / timeste
 class JointElasticity(Effect):
     """A spring between the motor of a joint, where its encoder is, and the link (a joint ``NAME.link``).
 
+    The joint's own spring and stops stay on the motor's side, which the encoder sees.
+
     The spring is damped by its stiffness times one timestep. Damping is integrated implicitly, and that much of it
     makes the whole spring implicit: -k (q + dt v) is the force at the end of the step, stable for any k.
     """

@@ -127,13 +127,15 @@ def add_link_joint(spec: mujoco.MjSpec, joint: str, name: str) -> Any:
     """A joint on the axis of another, which is then the motor and its encoder; the link is where their sum is.
 
     A joint's damping and friction are between its bodies, so that they go to the link: to a tendon ``NAME.bearing``,
-    whose length is that sum (:func:`on_bearing`). Its armature and its drives are the motor's.
+    whose length is that sum (:func:`on_bearing`). Its armature and its drives are the motor's, and so are its spring
+    and its stops (``range``), which act on what the encoder shows.
 
     A motor without inertia would be thrown about by the smallest force between it and the link, so where the model
     gives it (almost) none, the new joint has some: it counts only while motor and link move against each other.
     """
-    motor, total = spec.joint(joint), inertia(spec, joint)
-    link = motor.parent.add_joint(blank(), name=name, type=motor.type, pos=motor.pos, axis=motor.axis)
+    motor, total, model = spec.joint(joint), inertia(spec, joint), spec.copy().compile()
+    at, axis = model.joint(joint).pos, model.joint(joint).axis  # the spec's are in the frame that the joint may be in
+    link = motor.parent.add_joint(blank(), name=name, type=motor.type, pos=at, axis=axis)
     bearing = spec.tendon(joint + _BEARING)
     if bearing is None:
         bearing = add_fixed_tendon(spec, joint + _BEARING, joint)
@@ -145,7 +147,7 @@ def add_link_joint(spec: mujoco.MjSpec, joint: str, name: str) -> Any:
     if motor.type == mujoco.mjtJoint.mjJNT_SLIDE:
         # Without effect on a slide, except that MuJoCo no longer takes the mass matrix of its body for diagonal, as it
         # does for slides along its axes.
-        link.pos = np.add(motor.pos, 1.0)
+        link.pos = at + 1.0
     return link
 
 

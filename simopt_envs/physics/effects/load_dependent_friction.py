@@ -9,7 +9,7 @@ import numpy as np
 
 from simopt_envs.physics.effects.actuators import BRAKE, actuators, driven_joint
 from simopt_envs.physics.effects.effect import Effect, Motion, object_name
-from simopt_envs.physics.effects.joints import add_fixed_tendon, blank, inertia, scalar_joints
+from simopt_envs.physics.effects.joints import add_fixed_tendon, blank, inertia, is_slide, scalar_joints
 from simopt_envs.physics.parameters import Array, Parameter, Write
 
 _DRUM = 1.0  # m: its radius; the law does not depend on it
@@ -51,14 +51,16 @@ class LoadDependentFriction(Effect):
     def add(self, spec: mujoco.MjSpec, place: str) -> None:
         """See :meth:`Effect.add`."""
         joint = object_name(place)
-        model = spec.copy().compile()
+        unfused = spec.copy()
+        unfused.compiler.fusestatic = False  # the caliper is put on the spec's parent, a fused model's is another
+        model = unfused.compile()
         own, dt, link = inertia(spec, joint), spec.option.timestep, spec.joint(joint).parent
-        slides = spec.joint(joint).type == mujoco.mjtJoint.mjJNT_SLIDE
-        press, side = _across(spec.joint(joint).axis)
-        _add_drum(link, joint, press, side, slides)
+        slides, at_joint = is_slide(model, joint), model.joint(joint).pos
+        press, side = _across(model.joint(joint).axis)
+        _add_drum(link, joint, press, side, at_joint, slides)
         body = model.jnt_bodyid[model.joint(joint).id]
         anchor = np.zeros(3)
-        mujoco.mju_rotVecQuat(anchor, model.jnt_pos[model.joint(joint).id], model.body_quat[body])
+        mujoco.mju_rotVecQuat(anchor, at_joint, model.body_quat[body])
         at = model.body_pos[body] + anchor
         caliper = link.parent.add_body(blank(), name=joint + BRAKE, pos=at, quat=model.body_quat[body])
         weight = max(_WEIGHT * own, _LEAST)
@@ -114,14 +116,13 @@ def _drum(joint: str) -> str:
 
 
 def _across(axis: Array) -> tuple[Array, Array]:
-    """Two unit vectors at right angles to an axis and to each other."""
-    axis = axis / np.linalg.norm(axis)
+    """Two unit vectors at right angles to a unit axis and to each other."""
     first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     first /= np.linalg.norm(first)
     return first, np.cross(axis, first)
 
 
-def _add_drum(link: Any, joint: str, press: Array, side: Array, slides: bool) -> None:
+def _add_drum(link: Any, joint: str, press: Array, side: Array, at: Array, slides: bool) -> None:
     """What the shoes press on: a cylinder about a hinge's axis or a flat rail along a slide's, on the link."""
     axis = np.cross(press, side)
     # Columns: the drum's x, y and z in the frame of the link. A cylinder's axis is z; a rail is thick along z.
@@ -133,7 +134,7 @@ def _add_drum(link: Any, joint: str, press: Array, side: Array, slides: bool) ->
         name=_drum(joint),
         type=mujoco.mjtGeom.mjGEOM_BOX if slides else mujoco.mjtGeom.mjGEOM_CYLINDER,
         size=[_RAIL, _DRUM, _DRUM] if slides else [_DRUM, _DRUM, 0.0],
-        pos=next(j.pos for j in link.joints if j.name == joint),
+        pos=at,
         quat=quat,
         mass=0.0,
         **_UNSEEN,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import mujoco
 
 from simopt_envs.physics.effects.effect import Effect, Motion, object_name
@@ -25,6 +27,13 @@ class SensorBias(Effect):
     def places(self, model: mujoco.MjModel) -> tuple[str, ...]:
         """See :meth:`Effect.places`."""
         return scalar_joints(model) + sensors(model)
+
+    def add(self, spec: mujoco.MjSpec, place: str) -> None:
+        """See :meth:`Effect.add`."""
+        if place.startswith("joint:"):
+            model = spec.copy().compile()
+            for i, _ in _tendons(model, model.joint(object_name(place)).id):
+                spec.tendons[i].name = spec.tendons[i].name or f"tendon.{i}"  # a parameter writes by name
 
     def parameters(self, model: mujoco.MjModel, place: str) -> tuple[Parameter, ...]:
         """``bias``; of a sensor with several numbers ``bias_0``, ``bias_1`` ..."""
@@ -51,10 +60,16 @@ def _writes(model: mujoco.MjModel, joint: str) -> tuple[Write, ...]:
     j = model.joint(joint).id
     fields = ["qpos0", "qpos_spring"] + (["jnt_range"] if model.jnt_limited[j] else [])
     writes = [Write(field, joint, operation="add") for field in fields]
-    for i in range(model.ntendon):
+    for i, arm in _tendons(model, j):
         lengths = ["tendon_lengthspring"] + (["tendon_range"] if model.tendon_limited[i] else [])
-        path = slice(model.tendon_adr[i], model.tendon_adr[i] + model.tendon_num[i])
-        over = (model.wrap_type[path] == int(mujoco.mjtWrap.mjWRAP_JOINT)) & (model.wrap_objid[path] == j)
-        for arm in model.wrap_prm[path][over]:
-            writes += [Write(field, model.tendon(i).name, operation="add", factor=float(arm)) for field in lengths]
+        writes += [Write(field, model.tendon(i).name, operation="add", factor=arm) for field in lengths]
     return tuple(writes)
+
+
+def _tendons(model: mujoco.MjModel, joint: int) -> Iterator[tuple[int, float]]:
+    """The fixed tendons over a joint, and by how much they lengthen as it moves."""
+    for i in range(model.ntendon):
+        path = slice(model.tendon_adr[i], model.tendon_adr[i] + model.tendon_num[i])
+        over = (model.wrap_type[path] == int(mujoco.mjtWrap.mjWRAP_JOINT)) & (model.wrap_objid[path] == joint)
+        for arm in model.wrap_prm[path][over]:
+            yield i, float(arm)
