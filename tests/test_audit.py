@@ -12,9 +12,10 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from conftest import needs_examples
+from conftest import needs_effects, needs_examples
 
 from simopt_envs.measured import Finding, Recording, audit, audited, inspect_log, load_recording
+from simopt_envs.physics.effects import EFFECTS
 
 EXAMPLES = Path(__file__).parents[1] / "simopt_envs" / "measured" / "examples"
 
@@ -119,6 +120,17 @@ def test_a_decent_log_is_left_alone():
     assert audited(GOOD, MODEL).warnings == ()
 
 
+@needs_effects
+@pytest.mark.parametrize("width", [1e-12, 0.2])
+def test_a_log_is_left_alone_by_a_model_with_a_dead_band(width):
+    spec = mujoco.MjSpec.from_string(ARM)
+    EFFECTS["deadband"].add(spec, "actuator:shoulder")
+    spec.actuator("shoulder.deadband").forcerange = -width, width
+    assert audit(GOOD, spec.compile()) == []
+    (missing,) = audit(without("ctrl/shoulder"), spec.compile())
+    assert (missing.channel, missing.check) == ("ctrl/shoulder", "columns")
+
+
 def test_a_quick_motion_in_few_samples_is_one_and_noise_is_none():
     time = np.arange(150) * 0.02  # 50 Hz
     rng = np.random.default_rng(0)
@@ -154,6 +166,14 @@ DEFECTS: dict[str, tuple[Callable[[], Recording], str, str, str]] = {
     "time stands still": (lambda: with_time(np.zeros(3000)), "error", "time", "all time stamps are 0 s"),
     "duplicates": (
         lambda: with_rows(np.r_[0:2000, 1999:3000]), "warning", "duplicates", "1 repeated .* first in row 2000",
+    ),
+    "late stamps": (
+        lambda: with_time(np.where(np.arange(3000) % 999 == 500, np.roll(GOOD.time, -1) - 1e-5, GOOD.time)),
+        "warning", "duplicates", "3 repeated time stamps, or less than 0.1 sample periods before the next, first in",
+    ),
+    "a clock that was set": (
+        lambda: with_time(np.where(np.arange(3000) < 1, 0.0, 1.7e9 + GOOD.time)),
+        "error", "gaps", r"jumps by 1.7e\+09 s after row 0, from 0 s: cut",
     ),
     "gap": (lambda: with_rows(np.r_[0:2000, 2100:3000]), "warning", "gaps", "1 gaps .* longest 0.2.* s after row 1999"),
     "jitter": (
@@ -268,6 +288,29 @@ def test_a_defect_is_named(what):
             audited(log, MODEL)
 
 
+def test_a_column_that_the_model_does_not_have_is_left_out_whatever_it_holds():
+    foreign = replace(GOOD, columns={**GOOD.columns, "stamp": 1.7e18 + GOOD.time, "battery": np.full(3000, np.nan)})
+    assert [f.severity for f in audit(foreign, MODEL)] == ["warning", "warning"]
+    assert {f.severity for f in audit(foreign)} == {"error"}, "without a model, any column may be a signal"
+
+
+@pytest.mark.parametrize("rate", [4.0, 5.0, 7.0])
+def test_a_slow_log_is_audited(rate):
+    assert not [f for f in audit(GOOD.resample(1 / rate), MODEL) if f.severity == "error"]
+
+
+def test_the_velocities_of_a_floating_body_are_no_derivatives_of_its_position_alone():
+    xml = "<mujoco><worldbody><body><freejoint name='base'/><geom size='0.1'/></body></worldbody></mujoco>"
+    time = np.arange(500) / 100
+    place = np.stack([np.sin((k + 1) * time) for k in range(3)])
+    rate = np.stack([(k + 1) * np.cos((k + 1) * time) for k in range(3)])
+    turn = np.stack([np.cos(0.5 * time), np.sin(0.5 * time), 0 * time, 0 * time])  # at 1 rad/s about x
+    columns = {f"qpos/base/{k}": values for k, values in enumerate([*place, *turn])}
+    columns |= {f"qvel/base/{k}": values for k, values in enumerate([*rate, np.ones(500), 0 * time, 0 * time])}
+    findings = audit(Recording(time, columns), mujoco.MjModel.from_xml_string(xml))
+    assert not [f for f in findings if f.check == "velocity"]
+
+
 def test_actuators_without_a_name_are_told():
     """Where they share what they act on; a fit would fail later, in words that help nobody."""
     spec = mujoco.MjSpec.from_string(ARM)
@@ -299,6 +342,11 @@ def test_a_recording_that_begins_at_rest_passes(held):
     """Also where its command jumps as it begins."""
     for seed in range(20):
         assert not [f for f in audit(set_off(seed, held)) if f.check == "rest"], seed
+
+
+def test_a_short_recording_from_rest_is_audited():
+    time = np.arange(400) / 10_000
+    assert audit(replace(Recording(time, {"qpos/a": 1e-3 * time**2}), at_rest=True)) == []
 
 
 def test_a_recording_that_does_not_begin_at_rest_as_it_is_said_to_is_told():

@@ -13,7 +13,7 @@ import pytest
 from scipy.io import savemat
 
 from simopt_envs.measured import Finding, LogMapping, Recording, Source, load_recording, load_recordings
-from simopt_envs.measured.recording import warnings_of
+from simopt_envs.measured.recording import warnings_of, with_distinct_names
 from simopt_envs.measured.resample import band_limited, hold
 
 EXAMPLES = Path(__file__).parents[1] / "simopt_envs" / "measured" / "examples"
@@ -117,6 +117,28 @@ def test_time_that_repeats_is_thinned_and_time_that_runs_backward_refused():
         Recording(np.array([0.0, 0.2, 0.1]), {}).resample(0.1)
 
 
+@pytest.mark.parametrize("late", [1e-6, 1e-4])
+def test_a_stamp_just_before_the_next_makes_no_leap(late):
+    """As where a logger writes a sample late: a spline through both would turn noise into a motion."""
+    rng, time = np.random.default_rng(0), np.arange(2000) / 100
+    values = np.sin(time) + 1e-3 * rng.standard_normal(2000)
+    for row in (300, 700, 1500):
+        time[row] = time[row + 1] - late
+    uniform = Recording(time, {"qpos/a": values}).resample(0.01)
+    assert np.abs(uniform["qpos/a"] - np.sin(uniform.time)).max() < 0.01
+
+
+def test_what_is_all_but_gap_is_not_resampled():
+    time = np.r_[0.0, 1.7e9 + np.arange(299) / 100]  # a clock that was set
+    with pytest.raises(ValueError, match=r"300 samples in 1.7e\+09 s: cut it where time jumps"):
+        Recording(time, {"qpos/a": np.zeros(300)}).resample(0.01)
+
+
+def test_names_are_made_distinct():
+    named = [replace(sine(), name=name) for name in ("run", "run (2)", "run", "other", "run")]
+    assert [r.name for r in with_distinct_names(named)] == ["run", "run (2)", "run (3)", "other", "run (4)"]
+
+
 def test_select_split_and_windows():
     recording = sine(rate=100, seconds=10)
     part = recording.select(2.0, 3.0)
@@ -131,6 +153,7 @@ def test_select_split_and_windows():
     windows = list(recording.windows(1.0, step=2.0))
     assert [w.time[0] for w in windows] == [0, 2, 4, 6, 8]
     assert all(len(w) == 101 for w in windows)
+    assert list(sine(rate=100, seconds=0.8).windows(1.0)) == [], "it is shorter"
     holed = Recording(np.delete(recording.time, np.s_[450:470]), {"qpos/a": np.zeros(980)})
     assert [round(w.time[0], 2) for w in holed.windows(1.0)] == [0, 1, 2, 3, 5, 6, 7, 8]
 
@@ -213,6 +236,12 @@ def test_a_wrong_mapping_says_what_is_wrong(tmp_path, text, message):
         load_recording(tmp_path / "log.csv", mapping_file(tmp_path, text))
 
 
+def test_columns_of_unequal_length_are_named():
+    log = {"time": np.arange(100.0), "q": np.zeros(100), "u": np.zeros(99)}
+    with pytest.raises(ValueError, match="column 'ctrl/a' has 99 values, expected one for each of 100 rows"):
+        LogMapping({"qpos/a": Source("q"), "ctrl/a": Source("u")}, start=1.0).apply(log)
+
+
 def test_the_stamps_must_agree_with_a_declared_rate(tmp_path):
     path = sine(rate=100).save(tmp_path / "log.csv")
     columns = {"qpos/hinge": Source("qpos/hinge")}
@@ -277,9 +306,23 @@ def test_lerobot_episodes(tmp_path):
     with pytest.raises(ValueError, match="holds 2 episodes: name one, episode=0 to 1"):
         load_recording(path, mapping)
     assert load_recording(path, mapping, episode=1).name == "episode_000004"
+    by_its_name = replace(mapping, time=Source("timestamp"))
+    np.testing.assert_allclose(load_recording(path, by_its_name, episode=1).time, np.arange(5) / 30)
     assert set(load_recording(path, episode=0).columns) == {
         "action/pan", "action/lift", "observation.state/pan", "observation.state/lift",
     }  # fmt: skip
+
+
+def test_parquet_of_whole_nanoseconds_and_long_lists(tmp_path):
+    pa = pytest.importorskip("pyarrow")
+    from pyarrow import parquet
+
+    lists = pa.array([[1.0, 2.0], [3.0, 4.0]], type=pa.large_list(pa.float64()))
+    stamps = pa.array([1_700_000_000_000_000_001, 1_700_000_000_010_000_001], type=pa.int64())
+    parquet.write_table(pa.table({"t": stamps, "q": lists}), tmp_path / "a.parquet")
+    recording = load_recording(tmp_path / "a.parquet", LogMapping({"qpos/a": Source("q/1")}, Source("t", unit="ns")))
+    assert np.diff(recording.time) == pytest.approx(0.01, abs=1e-6)
+    np.testing.assert_array_equal(recording["qpos/a"], [2, 4])
 
 
 # --- damaged files --------------------------------------------------------------------------------------------------
@@ -324,6 +367,8 @@ def test_rows_that_broke_and_cells_that_are_no_numbers_are_named(tmp_path):
     np.testing.assert_allclose(recording.time, [0, 0.1, 0.3, 0.4])
     np.testing.assert_array_equal(recording["qpos/a"], [1, np.nan, np.nan, 5])
     assert list(recording.columns) == ["qpos/a"], "a column of text is no signal"
+    (tmp_path / "b.csv").write_text("time,qpos/a,comment\n0,1,\n0.1,2,hit\n0.2,3,")
+    assert list(load_recording(tmp_path / "b.csv").columns) == ["qpos/a"]
     messages = [str(warning) for warning in recording.warnings]
     assert messages == [
         "warning: 1 of 5 rows left out: they do not have 3 values; the first is data row 3",

@@ -10,7 +10,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from conftest import needs_examples
+from conftest import needs_effects, needs_examples
 
 from simopt_envs.measured import (
     Recording,
@@ -27,6 +27,7 @@ from simopt_envs.measured import (
 )
 from simopt_envs.measured import windows as windows_module
 from simopt_envs.physics import Parameter, ParameterSpace, Write
+from simopt_envs.physics.effects import EFFECTS
 
 EXAMPLES = Path(__file__).parents[1] / "simopt_envs" / "measured" / "examples"
 needs_data = pytest.mark.skipif(
@@ -217,6 +218,32 @@ def test_estimated_starts_are_as_right_as_they_say(left_out, noise):
     assert np.std(states.qvel - qvel[samples]) < 0.1
 
 
+def test_of_a_quaternion_the_errors_are_those_of_the_rotation():
+    model = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><body><joint name='ball' type='ball'/><geom size='0.1'/></body></worldbody></mujoco>"
+    )
+    time, rng = 0.01 * np.arange(600), np.random.default_rng(0)
+    truth = np.stack([np.cos(np.sin(time) / 2), np.sin(np.sin(time) / 2), 0 * time, 0 * time], axis=1)  # about x
+    samples, off = np.arange(50, 550, 50), []
+    for _ in range(8):
+        noisy = truth + 1e-2 * rng.standard_normal(truth.shape)
+        columns = {f"qpos/ball/{k}": noisy[:, k] for k in range(4)}
+        states, turned = estimate_states(model, Recording(time, columns), samples), np.empty(3)
+        for estimate, error, true in zip(states.qpos, states.qpos_error, truth[samples], strict=True):
+            mujoco.mj_normalizeQuat(model, estimate)
+            mujoco.mj_differentiatePos(model, turned, 1.0, true, estimate)
+            off.append(turned / error)
+    assert 0.7 < np.sqrt(np.mean(np.square(off))) < 1.4
+
+
+def test_columns_may_be_in_any_order():
+    model = cart()
+    recording, *_ = record(model, 600)
+    turned = replace(recording, columns=dict(reversed(recording.columns.items())))
+    both = cut_windows(model, [recording, turned], seconds=0.5)
+    np.testing.assert_array_equal(*np.split(both.measured, 2))
+
+
 def test_joints_without_a_column_are_found_from_sites_and_sensors():
     model = cart()
     recording, qpos, qvel = record(model, 1500)
@@ -330,6 +357,16 @@ def test_windows_leave_out_gaps_and_missing_starts():
     np.testing.assert_allclose(cut_windows(model, missing, 0.5).start_time, [0, 0.5, 1, 1.5, 2.5, 3])
     several = cut_windows(model, [replace(recording, name="a"), replace(recording, name="b")], 1.0)
     assert several.recording == ("a",) * 3 + ("b",) * 3
+
+
+@needs_effects
+def test_a_drive_with_a_dead_band_needs_no_more_columns_than_one_without():
+    recording, *_ = record(cart(), 300)
+    spec = mujoco.MjSpec.from_string(CART.format(armature=""))
+    EFFECTS["deadband"].add(spec, "actuator:servo")
+    loose, firm = (cut_windows(model, recording) for model in (spec.compile(), cart()))
+    np.testing.assert_array_equal(loose.commands, firm.commands[..., [0, 1, 1]])
+    np.testing.assert_allclose(simulate_windows(spec.compile(), loose), simulate_windows(cart(), firm), atol=1e-9)
 
 
 def test_what_cannot_be_replayed_is_refused():

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simopt_envs.measured.audit_model import LEAST_SAMPLES, against_model
+from simopt_envs.measured.channels import model_channels
 from simopt_envs.measured.recording import Finding, Recording
-from simopt_envs.measured.resample import GAP_PERIODS, Array, resolution, sample_period
+from simopt_envs.measured.resample import GAP_PERIODS, REPEATED_PERIODS, Array, repeated, resolution, sample_period
 from simopt_envs.measured.smoothing import smooth
 
 JITTER = 0.1  # an interval that differs from the median by more than this share of it is jittered ...
@@ -50,9 +51,11 @@ def audit(recording: Recording, model: mujoco.MjModel | None = None) -> list[Fin
     """
     findings = [*recording.warnings, *_time(recording)]
     if not any(finding.severity == "error" for finding in findings):
-        of_values = [f for name, values in recording.columns.items() for f in _values(name, recording.time, values)]
+        known = recording.columns if model is None else model_channels(model)
+        compared = recording.only([name for name in recording.columns if name in known])
+        of_values = [f for name, values in compared.columns.items() for f in _values(name, compared.time, values)]
         broken = {f.channel for f in of_values if f.severity == "error"}
-        findings += [*of_values, *_rest(recording, broken)]
+        findings += [*of_values, *_rest(compared, broken)]
         if model is not None:
             findings += against_model(recording, model, broken)
     return sorted(dict.fromkeys(findings), key=lambda finding: finding.severity != "error")
@@ -88,19 +91,24 @@ def _time(recording: Recording) -> Iterator[Finding]:
     if (same := intervals == 0).all():
         yield Finding.error("time", "time", f"all time stamps are {time[0]:g} s")
         return
-    if same.any():
+    period, again = recording.period, repeated(time)[:-1]
+    if again.any():
+        near = "" if same[again].all() else f", or less than {REPEATED_PERIODS:g} sample periods before the next"
         yield Finding.warning(
             "time",
             "duplicates",
-            f"{same.sum()} repeated time stamps, first in row {_first(same) + 1}; the last sample of each is used",
+            f"{again.sum()} repeated time stamps{near}, first in row {_first(again) + 1}; the last sample of each is"
+            " used",
         )
-    period = recording.period
     if not PLAUSIBLE_RATES[0] <= 1 / period <= PLAUSIBLE_RATES[1]:
         yield Finding.warning("time", "units", f"the rate is {1 / period:g} Hz: is time in seconds?")
     off = np.abs(intervals / period - 1)
-    gaps = intervals > GAP_PERIODS * period
+    gaps, row = intervals > GAP_PERIODS * period, int(np.argmax(intervals))
+    if recording.is_all_but_gap:
+        told = f"time jumps by {intervals[row]:.4g} s after row {row}, from {time[row]:.10g} s: cut the recording there"
+        yield Finding.error("time", "gaps", told)
+        return
     if gaps.any():
-        row = int(np.argmax(intervals))
         yield Finding.warning(
             "time",
             "gaps",
@@ -108,13 +116,13 @@ def _time(recording: Recording) -> Iterator[Finding]:
             f" the longest {intervals[row]:.4g} s after row {row} ({time[row]:.4g} s); windows that hold one are left"
             " out",
         )
-    jittered = (off > JITTER) & ~gaps & ~same
+    jittered = (off > JITTER) & ~gaps & ~again
     if jittered.mean() > JITTERED_SHARE:
         yield Finding.warning(
             "time",
             "jitter",
             f"{100 * jittered.mean():.1f} % of the intervals differ by more than {100 * JITTER:g} % from the median"
-            f" {1e3 * period:.4g} ms (shortest {1e3 * intervals[~same].min():.4g}, longest"
+            f" {1e3 * period:.4g} ms (shortest {1e3 * intervals[~again].min():.4g}, longest"
             f" {1e3 * intervals[~gaps].max():.4g} ms); signals are resampled",
         )
 
@@ -168,8 +176,8 @@ def _rest(recording: Recording, broken: set[str]) -> Iterator[Finding]:
         if not name.startswith(("qpos/", "site/")) or name in broken:
             continue
         smoothed = smooth(grid[name], grid.period)
-        after = grid.period * np.arange(max(3, round(UNREST_SECONDS / grid.period)))
-        moved = grid[name][: len(after)] - grid[name][0]
+        moved = (grid[name] - grid[name][0])[: max(3, round(UNREST_SECONDS / grid.period))]
+        after = grid.period * np.arange(len(moved))
         from_rest = 0.5 * UNREST * np.nanmax(np.abs(smoothed.acceleration)) * after**2
         if np.any(np.abs(moved) > from_rest + UNREST_NOISE * np.sqrt(2) * smoothed.noise):
             told = f"it moves by {moved[-1]:.3g} in its first {after[-1]:.3g} s, faster than its accelerations allow"

@@ -139,6 +139,9 @@ class LogMapping:
         else:
             assert self.sample_rate is not None
             time = np.arange(len(next(iter(columns.values())))) / self.sample_rate
+        for name, values in columns.items():
+            if len(values) != len(time):
+                raise ValueError(f"column {name!r} has {len(values)} values, expected one for each of {len(time)} rows")
         if self.start is None and self.end is None:
             return time, columns
         # Stamps that are not finite are kept for the audit to find.

@@ -155,7 +155,7 @@ def _text(path: Path, mapping: LogMapping | None) -> Iterator[_Table]:
     for name, cells in zip(names, zip(*rows, strict=True), strict=True):
         values = np.array([_number(cell) for cell in cells])
         words = [cell for cell, value in zip(cells, values, strict=True) if np.isnan(value) and _is_word(cell)]
-        if words and len(words) == len(values):
+        if words and np.isnan(values).all():
             continue  # a column of text: a mode, a comment
         if words:
             message = f"{len(words)} cells are no numbers and read as missing, the first is {words[0]!r}"
@@ -209,7 +209,9 @@ def _parquet(path: Path, mapping: LogMapping | None) -> Iterator[_Table]:
         yield _Table(path.stem, _flatten(numeric))
         return
     if "time" not in numeric and "timestamp" in numeric:
-        numeric["time"] = numeric.pop("timestamp")
+        numeric["time"] = numeric["timestamp"]  # its own name stays for a mapping
+        if mapping is None:
+            del numeric["timestamp"]
     columns = _flatten({n: v for n, v in numeric.items() if n not in _LEROBOT_INDICES}, _lerobot_names(path))
     for episode in np.unique(episodes):
         of_episode = episodes == episode
@@ -220,7 +222,8 @@ def _arrow_values(column: Any) -> np.ndarray | None:
     """A numeric column (T,), or a column of equally long lists (T, k); None for anything else."""
     import pyarrow as pa
 
-    if pa.types.is_list(column.type) or pa.types.is_fixed_size_list(column.type):
+    kind = column.type
+    if pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind):
         rows = column.to_pylist()
         widths = {len(row) for row in rows if row is not None}
         if len(widths) != 1:
@@ -230,8 +233,8 @@ def _arrow_values(column: Any) -> np.ndarray | None:
             return np.array([missing if row is None else row for row in rows], dtype=np.float64)
         except (TypeError, ValueError):
             return None
-    if pa.types.is_floating(column.type) or pa.types.is_integer(column.type) or pa.types.is_boolean(column.type):
-        return column.cast(pa.float64()).to_numpy()
+    if pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_boolean(kind):
+        return column.cast(pa.float64(), safe=False).to_numpy()  # ns since 1970 round to 0.3 us
     return None
 
 

@@ -3,15 +3,26 @@
 from __future__ import annotations
 
 import csv
+import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import count
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from simopt_envs.measured.resample import GAP_PERIODS, Array, band_limited, hold, longest_interval, sample_period
+from simopt_envs.measured.resample import (
+    GAP_PERIODS,
+    MOST_GAP,
+    Array,
+    band_limited,
+    hold,
+    longest_interval,
+    repeated,
+    sample_period,
+)
 from simopt_envs.physics.parameters import unknown_name
 
 SUFFIXES = (".csv", ".parquet", ".npz")
@@ -111,6 +122,11 @@ class Recording:
         """Seconds from the first to the last sample."""
         return float(self.time[-1] - self.time[0]) if len(self) else 0.0
 
+    @property
+    def is_all_but_gap(self) -> bool:
+        """Whether it has far fewer samples than its duration and rate ask for."""
+        return self.duration > 0 and self.duration > MOST_GAP * len(self) * self.period
+
     def select(self, start: float | None = None, end: float | None = None) -> Recording:
         """The samples with start <= time < end [s], stamps unchanged; ValueError if there is none."""
         low, high = -np.inf if start is None else start, np.inf if end is None else end
@@ -126,13 +142,18 @@ class Recording:
         return replace(self, columns={name: self[name] for name in columns})
 
     def in_order(self) -> Recording:
-        """Without repeated time stamps, the last sample of each kept; ValueError where time runs backward."""
+        """Without repeated time stamps, see :data:`REPEATED_PERIODS`, the last sample of each kept.
+
+        Raises:
+            ValueError: where time is not finite or runs backward.
+        """
         intervals = np.diff(self.time)
         if not np.isfinite(self.time).all() or (intervals < 0).any():
             raise ValueError(
                 f"{self.name}: time must be finite and never run backward; the audit says where it does not"
             )
-        return self if (intervals > 0).all() else self._rows(np.append(intervals > 0, True))
+        again = repeated(self.time)
+        return self._rows(~again) if again.any() else self
 
     def resample(self, period: float) -> Recording:
         """The recording on a uniform grid from its first stamp to its last.
@@ -143,11 +164,13 @@ class Recording:
             period: of the grid [s].
 
         Raises:
-            ValueError: for a period that is not positive, or time that runs backward.
+            ValueError: for a period that is not positive, time that runs backward, or a recording that is all but gap.
         """
         if not period > 0:
             raise ValueError(f"the resampling period must be positive, got {period:g} s")
         source = self.in_order()
+        if source.is_all_but_gap:
+            raise ValueError(f"{self.name}: {len(source)} samples in {self.duration:.4g} s: cut it where time jumps")
         grid = source.time[0] + period * np.arange(int(source.duration / period * (1 + 1e-9)) + 1)
         columns = {
             name: (hold if name.startswith("ctrl/") else band_limited)(source.time, values, grid)
@@ -180,7 +203,7 @@ class Recording:
             raise ValueError(f"windows need a positive length and step, got {seconds:g} s and {step} s")
         step = seconds if step is None else step
         source, slack = self.in_order(), 0.5 * self.period
-        for k in range(int((source.duration - seconds + slack) / step) + 1):
+        for k in range(math.floor((source.duration - seconds + slack) / step) + 1):
             start = source.time[0] + k * step
             end = min(start + seconds, source.time[-1])
             if longest_interval(source.time, start, end) <= GAP_PERIODS * source.period:
@@ -214,6 +237,16 @@ class Recording:
         from_start = bool(len(time)) and time[0] == self.time[0]
         columns = {name: values[keep] for name, values in self.columns.items()}
         return replace(self, time=time, columns=columns, at_rest=self.at_rest and from_start)
+
+
+def with_distinct_names(recordings: Iterable[Recording]) -> list[Recording]:
+    """The recordings, those with the name of an earlier one numbered: what tells windows apart are names."""
+    named: dict[str, Recording] = {}
+    for recording in recordings:
+        names = (f"{recording.name} ({k})" if k > 1 else recording.name for k in count(1))
+        name = next(name for name in names if name not in named)
+        named[name] = replace(recording, name=name)
+    return list(named.values())
 
 
 def warnings_of(recordings: Iterable[Recording]) -> tuple[Finding, ...]:

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
-from simopt_envs.measured.recording import Finding, Recording, warnings_of
+from simopt_envs.measured.recording import Finding, Recording, warnings_of, with_distinct_names
 from simopt_envs.measured.resample import Array
 from simopt_envs.measured.states import States
 from simopt_envs.measured.windows import Windows, WindowSimulator, cut_windows
@@ -116,13 +116,13 @@ def replay(
     Raises:
         ValueError: where the recordings cannot be replayed on this model, see :func:`cut_windows`.
     """
-    recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    recordings = with_distinct_names([recordings] if isinstance(recordings, Recording) else recordings)
     windows = cut_windows(model, recordings, seconds, step, keyframe)
     simulator = WindowSimulator(model, windows, space)
     simulated = simulator(xi)
     first_xi = None if xi is None else np.atleast_2d(np.asarray(xi, dtype=np.float64))[:1]
     spread = np.sqrt(np.sum(start_sensitivity(model, simulator, first_xi, simulated[0]) ** 2, axis=0))
-    warnings = (*warnings_of(recordings), *_unseen(model, windows.starts))
+    warnings = (*warnings_of(recordings), *unseen_joints(model, windows.starts))
     return Replay(windows, simulated, spread, warnings)
 
 
@@ -189,7 +189,7 @@ def _perturbed(model: mujoco.MjModel, starts: States, errors: float = 1.0) -> It
         yield replace(starts, qvel=qvel)
 
 
-def _unseen(model: mujoco.MjModel, starts: States) -> Iterator[Finding]:
+def unseen_joints(model: mujoco.MjModel, starts: States) -> Iterator[Finding]:
     """A warning for each joint whose start nothing in the recording determines."""
     for i in range(model.njnt):
         dof = int(model.jnt_dofadr[i])

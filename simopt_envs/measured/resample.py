@@ -11,6 +11,14 @@ Array = NDArray[np.float64]
 GAP_PERIODS = 5.0
 """An interval longer than this many sample periods is a gap: signals are not interpolated across it."""
 
+REPEATED_PERIODS = 0.1
+"""A stamp less than this many sample periods before the next repeats it: a logger wrote late. Between the two a spline
+would turn noise into a leap."""
+
+MOST_GAP = 100.0
+"""A recording that lasts this many times as long as its samples is all but gap: a clock was set, or two were joined."""
+
+_STANDING_SHARE = 0.05  # of the samples equal to the one before: the mark of a coarse encoder
 _PASS_BAND = 0.8  # of the new Nyquist frequency: leaves the filter room to fall before frequencies fold back
 
 
@@ -21,6 +29,13 @@ def sample_period(time: Array) -> float:
     if not len(forward):
         raise ValueError(f"a sample period needs two increasing time stamps, got {len(time)} without any")
     return float(np.median(forward))
+
+
+def repeated(time: Array) -> NDArray[np.bool_]:
+    """Which stamps (T,) of time that never runs backward repeat the next one, or all but do."""
+    intervals = np.diff(time)
+    least = REPEATED_PERIODS * sample_period(time) if (intervals > 0).any() else 0.0
+    return np.append((intervals <= 0) | (intervals < least), False)
 
 
 def longest_interval(time: Array, start: float, end: float) -> float:
@@ -39,6 +54,15 @@ def resolution(values: Array) -> float:
     steps = np.diff(distinct)
     steps = steps[steps > 1e-9 * (distinct[-1] - distinct[0])] if len(steps) else steps  # less is rounding
     return float(steps.min(initial=np.inf)) if len(steps) else 0.0
+
+
+def rounding_noise(values: Array) -> float:
+    """Standard deviation of what rounding is off by, of a signal that often stands on one count; else 0.
+
+    Where it stands, samples in a row differ by nothing, and tell of no noise.
+    """
+    stands = np.mean(np.diff(values) == 0) > _STANDING_SHARE
+    return resolution(values) / np.sqrt(12) if stands else 0.0
 
 
 def hold(time: Array, values: Array, at: Array) -> Array:

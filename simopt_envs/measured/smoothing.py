@@ -11,11 +11,10 @@ from functools import cache
 import numpy as np
 from scipy import linalg, optimize, signal
 
-from simopt_envs.measured.resample import Array, resolution
+from simopt_envs.measured.resample import Array, rounding_noise
 
 _ORDER = 3  # of the local polynomials: position, velocity, acceleration and jerk
 _NOISE_MARGIN = 1.05
-_STANDING_SHARE = 0.05  # of the samples equal to the one before: the mark of a coarse encoder
 _WINDOWS = (5, 7, 9, 13, 17, 23, 31, 43, 61, 85, 121, 171, 241)  # candidate widths in samples, a factor of sqrt 2 apart
 _LEAST_NOISE = 1e-7  # of a signal's standard deviation: less is not told from none
 _ONE_SIDED = np.array([-1.5, 2.0, -0.5])  # the rate at the first of three samples
@@ -64,8 +63,7 @@ def smooth(values: Array, period: float) -> Smoothed:
         residual = (filled - _filtered(filled, window))[~missing]
         leverage = _weights(window, 0)[window // 2, window // 2]
         noises[window] = float(np.sqrt(np.mean(residual**2) / (1 - leverage)))
-    stands = np.mean(np.diff(values) == 0) > _STANDING_SHARE
-    floor = _NOISE_MARGIN * max(min(noises.values()), resolution(values) / np.sqrt(12) if stands else 0.0)
+    floor = _NOISE_MARGIN * max(min(noises.values()), rounding_noise(values))
     window, noise = max((item for item in noises.items() if item[1] <= floor), default=(_WINDOWS[0], floor))
     value, velocity, acceleration = (
         np.where(missing, np.nan, _filtered(filled, window, d) / period**d) for d in range(3)

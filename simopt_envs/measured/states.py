@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from simopt_envs.measured.channels import Channel, model_channels, read_channels
+from simopt_envs.measured.channels import SCALAR_JOINTS, Channel, model_channels, read_channels
 from simopt_envs.measured.recording import Recording
 from simopt_envs.measured.resample import Array
 from simopt_envs.measured.smoothing import Smoothed, smooth, smooth_with_rate
@@ -19,7 +19,6 @@ from simopt_envs.physics.parameters import unknown_name
 _POSITION_PRIOR = 1.0  # sd of an unmeasured joint around the reference [rad, m]: decides only what nothing sees
 _VELOCITY_PRIOR = 10.0  # the same of its velocity around rest [rad/s, m/s]
 _REST_OFFSET, _REST_SPEED = 0.01, 0.1  # the same of what is said to be at rest: a rope that hangs swings a little
-_SCALAR = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE))
 _LEARNT_FROM = 8  # samples of a recording
 _TOLD = 5.0  # directions in all of these that sites and sensors must tell for that to tell of others
 _CLOSE = 1e-5  # share of squares and offsets that a step of a fit changes when it ends: far less than noise
@@ -83,7 +82,7 @@ def estimate_states(
     """
     channels = model_channels(model)
     seen = [channels[name] for name in recording.signals if name in channels]
-    rate_of = {c.object: c for c in seen if c.kind == "qvel" and model.jnt_type[c.object] in _SCALAR}
+    rate_of = {c.object: c for c in seen if c.kind == "qvel" and model.jnt_type[c.object] in SCALAR_JOINTS}
     paired = {c.name: rate_of[c.object] for c in seen if c.kind == "qpos" and c.object in rate_of}
     smoothed = {c.name: smooth(recording[c.name], recording.period) for c in seen if c.name not in paired}
     for name, rate in paired.items():
@@ -139,9 +138,12 @@ def _by_columns(
         qpos[:, channel.index] = signal.value[samples]
         rates[:, channel.index] = signal.velocity[samples]
         dofs = _dofs_of(model, channel)
-        qpos_error[:, dofs] = signal.value_error[samples, None]
-        qvel_error[:, dofs] = signal.velocity_error[samples, None]
-        if model.jnt_type[channel.object] in _SCALAR:
+        errors = np.stack([signal.value_error, signal.velocity_error])[:, samples, None]
+        if dofs.stop - dofs.start > 1:  # a quaternion has the sine of half the angle, and four numbers of three errors
+            others = 0.0 if unseen[dofs].all() else np.stack([qpos_error, qvel_error])[..., dofs]
+            errors = np.maximum(2 * errors, others)
+        qpos_error[:, dofs], qvel_error[:, dofs] = errors
+        if model.jnt_type[channel.object] in SCALAR_JOINTS:
             qacc[:, dofs] = signal.acceleration[samples, None]
         unseen[dofs] = False
     qvel = np.array([_tangent(model, q, rate) for q, rate in zip(qpos, rates, strict=True)]).reshape(-1, model.nv)

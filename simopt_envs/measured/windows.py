@@ -12,12 +12,13 @@ from numpy.typing import ArrayLike, NDArray
 from simopt_envs.measured.channels import Channel, actuator_names, model_channels
 from simopt_envs.measured.engines import BatchEngine, RolloutEngine, field_sizes
 from simopt_envs.measured.recording import Recording
-from simopt_envs.measured.resample import GAP_PERIODS, Array, hold, longest_interval
+from simopt_envs.measured.resample import GAP_PERIODS, Array, hold, longest_interval, rounding_noise
 from simopt_envs.measured.rest import holding_commands
 from simopt_envs.measured.states import States, estimate_states
 from simopt_envs.physics.parameters import ParameterSpace
 
 _NUMBERS_AT_ONCE = 2**25  # a chunk of worlds records at most so many, 256 MB
+_LEAST_NOISE = 1e-6  # of a channel's standard deviation: a perfect fit leaves no error to take it from
 _TIME_CONSTANTS = 5.0  # after which a filter has forgotten all but 1 % of a command
 
 
@@ -36,6 +37,7 @@ class Windows:
             them. Before a recording that begins at rest, those that held the model there.
         starts: the estimated states at the start.
         stride: steps of the model from one sample to the next.
+        rounding: standard deviation of what coarse encoders' rounding leaves, (c,).
     """
 
     channels: tuple[Channel, ...]
@@ -47,6 +49,7 @@ class Windows:
     past_commands: Array
     starts: States
     stride: int
+    rounding: Array
 
     def __len__(self) -> int:
         return len(self.start_time)
@@ -71,7 +74,8 @@ class Windows:
     def of_columns(self, names: Sequence[str]) -> Windows:
         """The same, compared in some of their columns alone."""
         shown = [c for c, channel in enumerate(self.channels) if channel.name in names]
-        return replace(self, channels=tuple(self.channels[c] for c in shown), measured=self.measured[..., shown])
+        channels = tuple(self.channels[c] for c in shown)
+        return replace(self, channels=channels, measured=self.measured[..., shown], rounding=self.rounding[shown])
 
     def at_half_the_timestep(self) -> Windows:
         """The same for a model with half the timestep."""
@@ -87,6 +91,11 @@ class Windows:
     def channel_scale(self) -> Array:
         """Standard deviation of each channel over all windows, (c,): what normalised errors are relative to."""
         return np.nanstd(self.measured.reshape(-1, len(self.channels)), axis=0)
+
+    def least_noise(self) -> Array:
+        """Standard deviation of each channel's noise, (c,), below which there is none to be told from errors."""
+        spread = self.channel_scale()
+        return np.maximum(self.rounding, _LEAST_NOISE * np.where(spread > 0, spread, 1.0))
 
 
 def cut_windows(
@@ -130,6 +139,7 @@ def cut_windows(
     samples = min(len(grid) for grid in grids) if seconds is None else round(seconds / period) + 1
     hop = samples if seconds is None else max(1, round((step or seconds) / period))
     past = max(_longest_history(model), int(np.ceil(history / timestep)) + 1)
+    rounding = np.array([_rounding(recordings, channel.name) for channel in channels])
     parts = []
     for recording, grid in zip(recordings, grids, strict=True):
         last = len(grid) - samples
@@ -153,6 +163,7 @@ def cut_windows(
                 past_commands=commands[:, :past],
                 starts=states,
                 stride=stride,
+                rounding=rounding,
             )
         )
     if not parts:
@@ -241,6 +252,12 @@ def _commands(
     return np.stack(columns, axis=-1) if columns else np.empty((*at.shape, 0))
 
 
+def _rounding(recordings: Sequence[Recording], column: str) -> float:
+    """What a column is off by where it stands on one count; of several recordings, as the finest steps say."""
+    found = [rounding_noise(recording[column]) for recording in recordings]
+    return min((noise for noise in found if noise > 0), default=0.0)
+
+
 def _is_usable(recording: Recording, grid: Recording, start: int, end: int) -> bool:
     """Whether a window holds no gap in time and no missing joint position at its start."""
     interval = longest_interval(recording.time, grid.time[start], min(grid.time[end], recording.time[-1]))
@@ -271,7 +288,7 @@ def _check_columns(model: mujoco.MjModel, recording: Recording, first: Recording
             f"no column of {recording.name} names anything in the model: it has {', '.join(recording.columns)}; the"
             f" model has {', '.join(known)}"
         )
-    if compared != [name for name in first.signals if name in known]:
+    if set(compared) != {name for name in first.signals if name in known}:
         raise ValueError(f"{recording.name} and {first.name} are compared in different columns; select common ones")
 
 
@@ -293,4 +310,5 @@ def _join(parts: list[Windows]) -> Windows:
         past_commands=rows("past_commands"),
         starts=States(*states),
         stride=first.stride,
+        rounding=first.rounding,
     )
