@@ -6,6 +6,7 @@
 Like `baselines.ppo_torch.TorchPPO`, a trainer is a callable `(make_vector_env, policy | None, rng) -> policy`.
 """
 
+import copy
 from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import dataclass
@@ -29,6 +30,7 @@ except ImportError as error:
 
 from baselines.ppo_torch import MakeVectorEnv, one_torch_thread, save_atomically
 from baselines.sb3_vec_env import SB3VecEnv
+from simopt_envs.adaptation.checkpoint import identity
 
 PPO_DEFAULTS: Mapping[str, Any] = {
     "n_steps": 50,
@@ -112,7 +114,7 @@ class SB3:
         with closing(make_vector_env(self.num_envs)) as env, one_torch_thread():
             model, worlds = self._model(env, seed=int(rng.integers(2**31)))
             if policy is not None:
-                model.set_parameters(policy.parameters)
+                model.set_parameters(copy.deepcopy(policy.parameters))  # Adam goes on in the very tensors it is given
                 worlds.obs_rms = policy.observation_statistics.copy()  # type: ignore[assignment]
                 worlds.ret_rms = policy.return_statistics.copy()
             model.learn(self.total_timesteps if policy is None else self.warm_start_timesteps)
@@ -123,6 +125,10 @@ class SB3:
             return_statistics=worlds.ret_rms,
             steps_trained=model.num_timesteps + (0 if policy is None else policy.steps_trained),
         )
+
+    def identity(self) -> dict[str, Any]:
+        """What identifies it in a checkpoint: its type and all arguments."""
+        return {"type": identity(type(self)), **identity(vars(self))}
 
     def save(self, policy: SB3Policy, path: Path) -> None:
         """Write a policy as plain tensors; a file already there is replaced at once or not at all."""

@@ -1,5 +1,7 @@
 """Adapting to recordings: a pendulum's friction from its logged motion, no policy and no training."""
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
@@ -69,6 +71,15 @@ def test_finds_the_friction_of_a_recording(model, windows, tmp_path):
         )
 
     first, *_, last = loop().run(4)
+    heavier, wider = mujoco.MjModel.from_xml_string(XML.replace('mass="0.5"', 'mass="1.5"')), SPACE.parameters
+    for simulator, what in (
+        (ReplaySimulator(heavier, SPACE, windows), "model_digest"),
+        (ReplaySimulator(model, ParameterSpace([replace(wider[0], high=2.0), wider[1]]), windows), "parameters_digest"),
+    ):
+        other = loop()
+        other.simulator = simulator
+        with pytest.raises(ValueError, match=rf"other settings: simulator.{what}"):
+            other.run(4, resume=True)
     assert last.distribution.median[0] == pytest.approx(TRUTH[0], rel=0.1)
     assert last.discrepancy_mean < 0.1 * first.discrepancy_mean
     assert last.verdict.label != "unexplained"

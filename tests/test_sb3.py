@@ -1,3 +1,5 @@
+import copy
+import json
 from functools import partial
 
 import gymnasium as gym
@@ -13,6 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 from baselines.ppo_sb3 import SB3
 from baselines.ppo_torch import one_torch_thread
 from baselines.sb3_vec_env import SB3VecEnv, infos_by_world
+from simopt_envs.adaptation.checkpoint import identity
 
 MODES = [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED]
 
@@ -269,6 +272,33 @@ def test_trainer_is_reproducible():
     weights = [torch.cat([value.ravel() for value in run.network.state_dict().values()]) for run in runs]
     assert torch.equal(weights[0], weights[1])
     assert not torch.equal(weights[0], weights[2])
+
+
+def test_a_warm_start_leaves_the_given_policy_as_it_is():
+    trainer = SB3(total_timesteps=800, num_envs=16, batch_size=200)
+    policy = trainer(make_worlds, None, np.random.default_rng(0))
+    before = copy.deepcopy(policy.parameters)
+    runs = [trainer(make_worlds, policy, np.random.default_rng(1)).parameters for _ in range(2)]
+    for expected, got in ((before, policy.parameters), runs):
+        torch.testing.assert_close(got, expected, rtol=0.0, atol=0.0)
+
+
+def test_what_identifies_a_trainer():
+    same, *others = (
+        SB3(**arguments)
+        for arguments in (
+            {"gamma": 0.9, "policy_kwargs": {"activation_fn": torch.nn.ReLU}},
+            {"gamma": 0.8, "policy_kwargs": {"activation_fn": torch.nn.ReLU}},
+            {"gamma": 0.9, "policy_kwargs": {"activation_fn": torch.nn.Tanh}},
+            {"gamma": 0.9, "policy_kwargs": {"activation_fn": torch.nn.ReLU}, "algorithm": SAC},
+            {"gamma": 0.9, "policy_kwargs": {"activation_fn": torch.nn.ReLU}, "num_envs": 4},
+        )
+    )
+    again = SB3(gamma=0.9, policy_kwargs={"activation_fn": torch.nn.ReLU})
+    assert identity(same) == json.loads(json.dumps(again.identity()))
+    assert identity(same)["type"] == "baselines.ppo_sb3.SB3"
+    assert identity(same)["algorithm"] == "stable_baselines3.ppo.ppo.PPO"
+    assert all(identity(other) != identity(same) for other in others)
 
 
 def test_other_algorithms(tmp_path):

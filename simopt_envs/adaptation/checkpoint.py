@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import shutil
@@ -11,6 +12,7 @@ from pathlib import Path
 from types import FunctionType
 from typing import Any
 
+import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -22,24 +24,35 @@ _RUN, _PHASES = "run.json", "checkpoints"
 def identity(component: Any) -> Any:
     """What identifies a part of a run, made of what JSON holds: a run may be resumed only with the same parts.
 
-    A component can say it by a method ``identity()``. Otherwise it is its type (a function's name), and the fields of
-    it and of its public attributes, as far as they are dataclasses.
+    A component can say it by a method ``identity()``. Otherwise it is its type (a function's or class's name), and the
+    fields of it and of its public attributes, as far as they are dataclasses. Of a model it is a digest.
     """
     if isinstance(component, np.ndarray | np.generic):
         return component.tolist()
+    if isinstance(component, Mapping):
+        return {str(name): identity(value) for name, value in component.items()}
+    if isinstance(component, mujoco.MjModel):
+        saved = np.empty(mujoco.mj_sizeModel(component), dtype=np.uint8)
+        mujoco.mj_saveModel(component, None, saved)
+        return hashlib.sha256(saved.tobytes()).hexdigest()[:16]
     if isinstance(component, list | tuple):
         return [identity(item) for item in component]
     if component is None or isinstance(component, bool | int | float | str):
         return component
-    if callable(getattr(component, "identity", None)):
-        return component.identity()
-    if isinstance(component, FunctionType):
+    if isinstance(component, FunctionType | type):
         return f"{component.__module__}.{component.__qualname__}"
+    if callable(getattr(component, "identity", None)):
+        return identity(component.identity())
     public = {name: value for name, value in getattr(component, "__dict__", {}).items() if not name.startswith("_")}
     if not is_dataclass(component):
         public = {name: value for name, value in public.items() if is_dataclass(value)}
     kind = type(component)
     return {"type": f"{kind.__module__}.{kind.__qualname__}", **{k: identity(v) for k, v in public.items()}}
+
+
+def digest(*content: Any) -> str:
+    """A short hash of what identifies some things."""
+    return hashlib.sha256(json.dumps(identity(content)).encode()).hexdigest()[:16]
 
 
 class Checkpoint:

@@ -32,7 +32,6 @@ from simopt_envs.physics.parameters import Array
 _DIFFERENCE = 1e-3  # of the prior's standard deviation: well above the tolerance of MuJoCo's constraint solver
 _DIVERGED = 10.0  # the error of a sample that the simulation did not reach, in standard deviations of its channel
 _NOISE_ITERATIONS = 10
-_LEAST_NOISE = 1e-6  # of a channel's standard deviation: a perfect fit leaves no error to take it from
 _UNTOLD = 0.5  # a direction whose variance the data leave above this share of the prior's is one they hardly tell
 _NAMED = 0.25  # in such a direction parameters below this share of the largest are not named
 
@@ -135,8 +134,7 @@ class WindowMisfit:
         starts = start_sensitivity(self._model, self._simulator, self.xi(u[None]))
         self.rollouts += (len(starts) + 1) * len(self._windows)
         starts = np.where(self._counted, np.nan_to_num(starts), 0.0)
-        spread = self._windows.channel_scale()
-        least = _LEAST_NOISE * np.where(spread > 0, spread, 1.0)
+        least = self._windows.least_noise()
         scale = np.maximum(self._rms(errors[0]), least)
         for _ in range(_NOISE_ITERATIONS):  # the larger the scale, the less is laid to the starts
             white = Noise.of(scale, starts).whiten(errors)[0]

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import mujoco
 import numpy as np
 from gymnasium.vector import VectorEnv
-from numpy.typing import NDArray
 
+from simopt_envs.adaptation.checkpoint import digest
 from simopt_envs.adaptation.protocols import Policy
 from simopt_envs.adaptation.rollouts import Rollouts
 from simopt_envs.distributions.distribution import Sampler
@@ -61,7 +60,8 @@ class ReplaySimulator:
 
     def identity(self) -> dict[str, Any]:
         """What identifies it in a checkpoint."""
-        return {"parameters": list(self.parameters.names), "windows": len(self._windows)}
+        parameters = {"parameters": self.parameters.names, "parameters_digest": digest(tuple(self.parameters))}
+        return {**parameters, "model_digest": digest(self._model), "windows": len(self._windows)}
 
     def make_vector_env(self, num_envs: int, distribution: Sampler, seed: int) -> VectorEnv:
         """There is nothing to train in.
@@ -100,21 +100,10 @@ class ReplaySimulator:
     def _simulate(self, chosen: tuple[int, ...], space: ParameterSpace) -> WindowSimulator:
         """The simulator of some windows; the last one is kept, as updates come several on the same windows."""
         if self._simulator is None or self._simulator[:2] != (chosen, space):
-            windows = _select(self._windows, np.array(chosen))
+            windows = self._windows.select(np.array(chosen))
             self._simulator = chosen, space, WindowSimulator(self._model, windows, space, self._num_threads)
         return self._simulator[2]
 
 
 def _replay(xi: Array, simulator: ReplaySimulator, chosen: tuple[int, ...], space: ParameterSpace) -> Array:
     return simulator._simulate(chosen, space)(xi)
-
-
-def _select(windows: Windows, chosen: NDArray[np.intp]) -> Windows:
-    """Some of the windows."""
-    per_window = ("start_time", "measured", "commands", "past_commands")
-    return replace(
-        windows,
-        recording=tuple(windows.recording[i] for i in chosen),
-        starts=windows.starts.select(chosen),
-        **{name: getattr(windows, name)[chosen] for name in per_window},
-    )

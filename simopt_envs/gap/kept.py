@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
 
 import simopt_envs
-from simopt_envs.adaptation.checkpoint import Checkpoint, identity
+from simopt_envs.adaptation.checkpoint import Checkpoint, digest
 from simopt_envs.gap.hypothesis import Hypothesis
 from simopt_envs.gap.plain import Plain
 from simopt_envs.measured.windows import Windows
@@ -27,12 +24,10 @@ def kept_fits(directory: str | Path | None, plain: Plain, motion: Motion, *windo
     """
     if directory is None:
         return Checkpoint(None, {}, resume=True)
-    model = np.empty(mujoco.mj_sizeModel(plain.model), dtype=np.uint8)
-    mujoco.mj_saveModel(plain.model, None, model)
     settings = {
-        "model": _digest(model),
-        "priors": _digest(plain.prior.to_dict(), tuple(plain.prior.space)),
-        "recordings": _digest(motion, *windows),
+        "model": digest(plain.model),
+        "priors": digest(plain.prior.to_dict(), tuple(plain.prior.space)),
+        "recordings": digest(motion, *windows),
         "versions": [simopt_envs.__version__, mujoco.__version__, np.__version__],
     }
     return Checkpoint(Path(directory), settings, resume=True)
@@ -40,9 +35,4 @@ def kept_fits(directory: str | Path | None, plain: Plain, motion: Motion, *windo
 
 def key_of(hypothesis: Hypothesis, *given: Array) -> str:
     """What a fit of a hypothesis is called, for all that its result depends on besides the data."""
-    return _digest(list(map(str, hypothesis.candidates)), *given)
-
-
-def _digest(*content: Any) -> str:
-    as_json = json.dumps([item if isinstance(item, dict) else identity(item) for item in content])
-    return hashlib.sha256(as_json.encode()).hexdigest()[:16]
+    return digest(list(map(str, hypothesis.candidates)), *given)
