@@ -620,7 +620,7 @@ def _starting_policy(
         if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
             raise TypeError(f"TorchPPO needs a one-dimensional Box as {name} space, got {space}")
     observation_size = env.single_observation_space.shape[0]  # type: ignore[index]
-    low, high = env.single_action_space.low.tolist(), env.single_action_space.high.tolist()  # type: ignore[attr-defined]
+    low, high = _single_precision_bounds(env.single_action_space)  # type: ignore[arg-type]
     if policy is None:
         fresh = TorchPolicy(observation_size, low, high, config.hidden, config.initial_log_std, generator)
         observed = env.single_observation_space
@@ -634,6 +634,16 @@ def _starting_policy(
             f"{env} has {(observation_size, low, high)}"
         )
     return copy.deepcopy(policy)
+
+
+def _single_precision_bounds(space: gym.spaces.Box) -> tuple[list[float], list[float]]:
+    """The bounds as the policy keeps them, rounded inwards: no action may lie outside a `Box` in double precision."""
+    exact_low, exact_high = torch.tensor(space.low), torch.tensor(space.high)
+    low, high = exact_low.float(), exact_high.float()
+    return (
+        low.where((low >= exact_low) | low.isinf(), low.nextafter(high)).tolist(),
+        high.where((high <= exact_high) | high.isinf(), high.nextafter(low)).tolist(),
+    )
 
 
 def evaluate(policy: TorchPolicy, env: VectorEnv, seed: int) -> Array:

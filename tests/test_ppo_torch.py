@@ -157,6 +157,30 @@ def test_actions_stay_in_the_space():
     assert np.all(policy.act(np.zeros((3, 1))) == 2.0)
 
 
+class Precise(Aim):
+    """Aim with bounds that single precision cannot hold, and which it rounds outwards."""
+
+    action_space = gym.spaces.Box(-0.3, 0.3, (1,), np.float64)
+
+    def step(self, action):
+        assert self.action_space.contains(action)
+        return super().step(action)
+
+
+def test_bounds_in_double_precision_are_kept_and_fit_again(tmp_path):
+    config = replace(SMALL, iterations=1, initial_log_std=1.0)
+    policy, trainer = train(config, env_class=Precise), TorchPPO(config)
+    trainer.save(policy, tmp_path / "policy.pt")
+    for start in (policy, trainer.load(tmp_path / "policy.pt")):
+        train(replace(config, warm_start_iterations=1), policy=start, env_class=Precise)
+    for bias in (-100.0, 100.0):
+        with torch.no_grad():
+            policy.actor[-1].bias.fill_(bias)
+        (action,) = policy.act(np.zeros((1, 1)))
+        assert Precise.action_space.contains(action)
+        assert action == pytest.approx(0.3 * np.sign(bias), rel=1e-6)
+
+
 def test_stops_at_the_success_rate_asked_for():
     seen = []
     config = replace(SMALL, iterations=60, success_stop=0.9, evaluation_share=0.25, evaluation_episodes=16)

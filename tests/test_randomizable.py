@@ -2,8 +2,10 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+from conftest import needs_effects
 
 from simopt_envs.physics import Parameter, Write
+from simopt_envs.physics.effects import EFFECTS
 from wrappers import RandomizablePhysics, model_parameters
 
 XML = """
@@ -60,6 +62,15 @@ class CartEnv(gym.Env):
         return self.observe(), 0.0, False, False, {}
 
 
+class PlacingEnv(CartEnv):
+    """Draws where the cart stands at each reset."""
+
+    def reset(self, *, seed=None, options=None):
+        gym.Env.reset(self, seed=seed)
+        self.model.body("cart").pos[0] = self.np_random.uniform(0.5, 1.0)
+        return super().reset(options=options)
+
+
 def all_fields(model: mujoco.MjModel) -> dict[str, np.ndarray]:
     names = [n for n in dir(model) if not n.startswith("_") and isinstance(getattr(model, n), np.ndarray)]
     return {name: getattr(model, name).copy() for name in names} | {"gravity": model.opt.gravity.copy()}
@@ -94,6 +105,14 @@ def test_patterns_find_named_objects_that_have_a_value():
         "geom_friction of rod": (1.0, "1"),
         "gravity": (9.81, "m/s^2"),
     }
+
+
+@needs_effects
+def test_actuators_that_come_after_one_without_a_command_are_found():
+    spec = mujoco.MjSpec.from_string(XML)
+    EFFECTS["cogging"].add(spec, "joint:hinge")
+    spec.add_actuator(name="later", target="rail", trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    assert "actuator_gain of later" in model_parameters(spec.compile(), ["actuator_gain of *"]).names
 
 
 def test_the_kind_of_object_may_be_named():
@@ -191,6 +210,40 @@ def test_a_hard_reset_gets_the_values_into_the_new_model():
         assert hard.unwrapped.model is not model
     np.testing.assert_array_equal(motion(hard, {}), motion(soft, {}))
     assert not np.array_equal(motion(hard, {}), motion(hard, values))
+
+
+def body_x(body: str) -> Parameter:
+    return Parameter(f"{body}_x", "m", 0.0, -0.2, 0.2, "linear", (Write("body_pos", body, (0,), "add"),))
+
+
+def test_a_parameter_that_the_environment_writes_itself_is_refused():
+    env = RandomizablePhysics(PlacingEnv(), [body_x("pole"), "gravity"])  # another place in the same field
+    env.reset(seed=0, options={"parameters": {"pole_x": 0.1}})
+    assert env.unwrapped.model.body("pole").pos[0] == 0.1
+    env = RandomizablePhysics(PlacingEnv(), ["gravity", body_x("cart")])
+    message = r"'cart_x' is not in force: it set body_pos to \[0.2\], and .*PlacingEnv.* itself.*leaves alone"
+    with pytest.raises(ValueError, match=message):
+        env.reset(seed=0, options={"parameters": {"cart_x": 0.2}})
+
+
+def test_an_environment_with_parameters_of_its_own_points_to_these():
+    env = RandomizablePhysics(gym.make("SimOpt/Drawer-v0"), ["dof_damping of joint1"])
+    env.reset(seed=0)
+    nominal = env.parameters["dof_damping of joint1"].nominal
+    with pytest.raises(ValueError, match=r"set dof_damping to .* use its own parameters \(DistributionWrapper alone"):
+        env.reset(seed=0, options={"parameters": {"dof_damping of joint1": 5 * nominal}})
+
+
+def test_a_geom_grows_with_all_that_contacts_are_looked_for_in():
+    size = Parameter("rod", "m", 0.02, 0.01, 0.5, writes=(Write("geom_size", "rod", (0,)),))
+    if not hasattr(mujoco.MjModel, "_setconst_inputs"):
+        with pytest.raises(ValueError, match="'rod' writes geom_size, which needs MuJoCo 4"):
+            RandomizablePhysics(CartEnv(), [size])
+        return
+    env = RandomizablePhysics(CartEnv(), [size])
+    env.reset(options={"parameters": {"rod": 0.4}})
+    model = env.unwrapped.model
+    assert model.geom_rbound[model.geom("rod").id] == pytest.approx(0.4 + model.geom("rod").size[1])
 
 
 def test_the_environments_state_is_left_alone():

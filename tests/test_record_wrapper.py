@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from typing import Any
 
 import gymnasium as gym
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 import simopt_envs  # noqa: F401 - registers the environments
-from simopt_envs.measured import LogMapping, Source, load_recording, load_recordings, replay
+from simopt_envs.measured import LogMapping, Recording, Source, load_recording, load_recordings, replay
 from wrappers.record import RecordEpisodes
 
 ARM = """
@@ -150,6 +151,62 @@ def test_episodes_cut_short_are_kept_and_numbers_go_on(tmp_path):
     run(again, 1)
     assert [path.name for path in again.recordings] == ["episode_000002.npz"]
     assert [len(load_recording(path)) for path in [*env.recordings, *again.recordings]] == [4, 4, 9]
+
+
+def test_episodes_that_end_at_the_same_time_get_numbers_of_their_own(tmp_path, monkeypatch):
+    first, second = (RecordEpisodes(Arm(), tmp_path) for _ in range(2))
+    save, waiting = Recording.save, [second]
+
+    def save_while_another_does(recording, path):
+        while waiting:
+            run(waiting.pop(), 1, steps=8)
+        return save(recording, path)
+
+    monkeypatch.setattr(Recording, "save", save_while_another_does)
+    run(first, 1, steps=8)
+    assert {path.name for path in tmp_path.iterdir()} == {"episode_000000.npz", "episode_000001.npz"}
+    assert (*first.recordings, *second.recordings) == tuple(sorted(tmp_path.iterdir()))
+
+    looked = iter([1, 2])  # the other one finished number 1 after this one looked
+    monkeypatch.setattr("wrappers.record._next_number", lambda folder: next(looked))
+    run(first, 1)
+    assert [path.name for path in sorted(tmp_path.iterdir())] == [f"episode_00000{i}.npz" for i in range(3)]
+
+
+def test_a_recording_is_there_as_a_whole_or_not_at_all(tmp_path, monkeypatch):
+    def be_killed(recording, path):
+        path.write_bytes(b"PK")
+        raise KeyboardInterrupt
+
+    (tmp_path / "episode_000004_notes.txt").write_text("")  # no number to go on from
+    with monkeypatch.context() as patch:
+        patch.setattr(Recording, "save", be_killed)
+        with pytest.raises(KeyboardInterrupt):
+            run(RecordEpisodes(Arm(), tmp_path), 1)
+    assert not [*tmp_path.glob("episode_*.npz")]
+    env = RecordEpisodes(Arm(), tmp_path)
+    run(env, 1)
+    assert [*tmp_path.glob("episode_*.npz")] == env.recordings
+    assert len(load_recording(env.recordings[0])) == 9
+
+
+class Driver:
+    """A robot's, which cannot be copied."""
+
+    def __init__(self) -> None:
+        self.lock, self.seconds = threading.Lock(), 0.0
+
+    def now(self) -> float:
+        self.seconds += 0.5
+        return self.seconds
+
+
+def test_the_clock_may_belong_to_something_that_cannot_be_copied(tmp_path):
+    driver = Driver()
+    env = RecordEpisodes(Robot(), tmp_path, clock=driver.now)
+    run(env, 1)
+    assert driver.seconds == 4.5
+    np.testing.assert_array_equal(load_recording(env.recordings[0]).time, 0.5 * np.arange(9))
 
 
 def test_a_registered_env_keeps_its_behaviour_and_its_spec_rebuilds_the_wrapper(tmp_path):

@@ -1,3 +1,4 @@
+import threading
 from functools import partial
 
 import gymnasium as gym
@@ -100,6 +101,21 @@ def test_the_distribution_can_be_replaced_between_episodes():
 def test_an_environment_without_parameters_is_refused():
     with pytest.raises(TypeError, match="wrap it in RandomizablePhysics"):
         DistributionWrapper(gym.make("InvertedPendulum-v5"), MASSES)
+
+
+class Locked(Fixed):
+    """A distribution that cannot be copied."""
+
+    def __init__(self, *row: float):
+        super().__init__(*row)
+        self.lock = threading.Lock()
+
+
+def test_a_distribution_need_not_be_copied():
+    locked = Locked(6.0, 2.0, 3.0)
+    assert randomized(locked).reset()[1]["parameters"][MASS] == 2.0
+    venv = DistributionVectorWrapper(SyncVectorEnv([randomized] * 2), locked)
+    assert (venv.reset()[1]["parameters"][MASS] == 2.0).all()
 
 
 COMPOSITIONS = {
@@ -294,6 +310,17 @@ def test_dropouts_lose_the_tracked_channels_together():
     assert lost[:, 1].mean() == pytest.approx(0.2, abs=0.05)
     np.testing.assert_array_equal(lossy[~lost], clean[~lost])
     np.testing.assert_array_equal(seen_by(SensorDropout(pendulum(), 0.0)), clean[:51])
+
+
+def test_sensors_of_one_kind_are_independent():
+    def lost(env):
+        return np.isnan(seen_by(env, 500))[1:]
+
+    alone = SensorDropout(pendulum(), 0.5, [0])
+    both = lost(SensorDropout(SensorDelay(alone, 0), 0.5, [1]))
+    np.testing.assert_array_equal(both[:, 0], lost(SensorDropout(pendulum(), 0.5, [0]))[:, 0])
+    assert np.mean(both[:, 0] == both[:, 1]) == pytest.approx(0.5, abs=0.1)
+    np.testing.assert_array_equal(lost(SensorDropout(alone, 0.5, [1])), both)
 
 
 @pytest.mark.parametrize(

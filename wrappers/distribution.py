@@ -35,7 +35,8 @@ class DistributionWrapper(gym.Wrapper, RecordConstructorArgs):
     """
 
     def __init__(self, env: gym.Env, distribution: Sampler):
-        RecordConstructorArgs.__init__(self, distribution=distribution)
+        # As it is: a user's own may hold a lock or a socket, which cannot be copied.
+        RecordConstructorArgs.__init__(self, _disable_deepcopy=True, distribution=distribution)
         super().__init__(env)
         self._draws = EpisodeDraws(_parameters(env), distribution)
 
@@ -78,7 +79,7 @@ class DistributionVectorWrapper(VectorWrapper, RecordConstructorArgs):
     """
 
     def __init__(self, env: VectorEnv, distribution: Sampler):
-        RecordConstructorArgs.__init__(self, distribution=distribution)
+        RecordConstructorArgs.__init__(self, _disable_deepcopy=True, distribution=distribution)
         super().__init__(env)
         base: Any = env.unwrapped
         self._draws: EpisodeDraws | None = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -27,8 +28,8 @@ class RecordEpisodes(gym.Wrapper, RecordConstructorArgs):
     Row k holds what was measured at step k and the command that was then held until row k + 1; the last command is
     repeated beside the last measurement. An environment around a MuJoCo model is recorded under the model's names
     (``ctrl/``, ``qpos/``, ``qvel/``, ``sensor/``, ``site/``), any other one under the names given, or
-    ``observation/0`` ... and ``action/0`` .... Episodes are numbered on from those already in the folder; one cut short
-    by ``reset`` or ``close`` is written too.
+    ``observation/0`` ... and ``action/0`` .... Episodes are numbered on from those already in the folder, which several
+    processes may share; one cut short by ``reset`` or ``close`` is written too.
 
     Args:
         env: the environment.
@@ -70,6 +71,7 @@ class RecordEpisodes(gym.Wrapper, RecordConstructorArgs):
     ):
         RecordConstructorArgs.__init__(
             self,
+            _disable_deepcopy=True,  # the clock may be a method of the robot's driver
             folder=folder,
             observations=observations,
             actions=actions,
@@ -163,10 +165,22 @@ class RecordEpisodes(gym.Wrapper, RecordConstructorArgs):
             signals, commands = np.array(self._signals), np.array([*self._commands, self._commands[-1]])
             columns = dict(zip(self._source.command_names, commands.T, strict=True))
             columns |= {self._source.signal_names[i]: signals[:, i] for i in self._kept}
-            name = f"episode_{_next_number(self._folder):06d}"
-            recording = Recording(np.array(self._times) - self._times[0], columns, name)
-            self.recordings.append(recording.save(self._folder / f"{name}{self._suffix}"))
+            self.recordings.append(self._save(Recording(np.array(self._times) - self._times[0], columns)))
         self._times, self._signals, self._commands = [], [], []
+
+    def _save(self, recording: Recording) -> Path:
+        """Write a file of a number of its own, whole or not at all: several processes may share the folder."""
+        self._folder.mkdir(parents=True, exist_ok=True)
+        while True:
+            path = self._folder / f"episode_{_next_number(self._folder):06d}{self._suffix}"
+            unfinished = path.with_name(f".{path.name}")
+            try:
+                unfinished.touch(exist_ok=False)  # claims the number: who did not create this never writes ``path``
+            except FileExistsError:
+                continue
+            if not path.exists():  # else its writer finished since the folder was listed
+                return recording.save(unfinished).replace(path)
+            unfinished.unlink()
 
 
 class _ModelSource:
@@ -288,5 +302,6 @@ def _time_step(env: gym.Env) -> float:
 
 
 def _next_number(folder: Path) -> int:
-    numbers = [int(path.stem.removeprefix("episode_")) for path in folder.glob("episode_[0-9]*.*")]
-    return max(numbers, default=-1) + 1
+    """The number after those in a folder, also of files that are being written."""
+    matches = (re.fullmatch(r"\.?episode_(\d+)", path.stem) for path in folder.iterdir())
+    return max((int(match[1]) for match in matches if match), default=-1) + 1

@@ -1,7 +1,8 @@
 """What measuring adds to an observation: noise, delay, drop-outs.
 
 In vector environments, wrap the sub-environments. Each sensor has a generator of its own, seeded by a seeded ``reset``
-and apart from the environment's, so that the same seed gives the same motion with and without it.
+and apart from the environment's and those of other sensors, so that the same seed gives the same motion with and
+without it.
 """
 
 from __future__ import annotations
@@ -29,14 +30,18 @@ class _Sensor(gym.Wrapper, RecordConstructorArgs):
     def __init__(self, env: gym.Env, stream: int, **arguments: Any):
         RecordConstructorArgs.__init__(self, **arguments)
         super().__init__(env)
-        self._stream = stream
+        beneath, layer = 0, env
+        while isinstance(layer, gym.Wrapper):
+            beneath += isinstance(layer, _Sensor) and layer._spawn_key[0] == stream
+            layer = layer.env
+        self._spawn_key: tuple[int, ...] = (stream, beneath) if beneath else (stream,)
         self._rng = np.random.default_rng()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode; a seed restarts the sensor's generator as well."""
         observation, info = self.env.reset(seed=seed, options=options)
         if seed is not None:
-            self._rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(self._stream,)))
+            self._rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=self._spawn_key))
         return self._first(observation), info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
