@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import mujoco
 import numpy as np
 
-from simopt_envs.measured import Recording
+from simopt_envs.gap.thresholds import WINDOW
+from simopt_envs.gap.trial import Data
+from simopt_envs.measured import Recording, cut_windows
+from simopt_envs.physics.effects.actuator_delay import LONGEST
 
 MODEL = """
 <mujoco model="two_link">
@@ -47,6 +51,13 @@ def record(
         field *= np.exp(0.05 * rng.standard_normal(field.shape))
     mujoco.mj_setConst(model, mujoco.MjData(model))
     return [_record_one(model, law, rng, seconds, f"run_{i}") for i in range(count)]
+
+
+def halves(model: mujoco.MjModel, recordings: list[Recording]) -> Data:
+    """Windows of every other recording to fit and of the rest held out, however fast they move."""
+    fitted, held_out = tuple(recordings[::2]), tuple(recordings[1::2])
+    cut = partial(cut_windows, model, seconds=WINDOW, history=2 * LONGEST, centred=True)
+    return Data(cut(fitted), cut(held_out), fitted, held_out)
 
 
 def _record_one(model: mujoco.MjModel, law: Law, rng: np.random.Generator, seconds: float, name: str) -> Recording:

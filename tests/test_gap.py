@@ -12,7 +12,7 @@ from conftest import needs_effects
 from gap_plant import MODEL, record
 
 from simopt_envs.gap import find_gap
-from simopt_envs.measured import cut_windows, simulate_windows
+from simopt_envs.measured import Recording, cut_windows, simulate_windows
 from simopt_envs.physics.effects import EFFECTS
 
 pytestmark = needs_effects
@@ -68,7 +68,7 @@ def test_a_right_model_with_wrong_plain_parameters_lacks_nothing():
     gap = find_gap(spec(), record(lambda q, v: np.zeros(2), np.random.default_rng(2)), effects=FEW)
     assert gap.verdict == "none"
     assert gap.effects == ()
-    assert gap.errors.refit < 1.1 * gap.errors.noise_floor < gap.errors.before
+    assert gap.errors.refit < 1.25 * gap.errors.noise_floor < gap.errors.before  # of ten such it is 0.89 to 1.2 times
 
 
 def test_a_model_that_was_repaired_is_searched_again_but_for_what_it_has():
@@ -149,6 +149,27 @@ def test_what_cannot_be_searched_is_said_before_any_work():
     broken = replace(recordings[0], columns={**recordings[0].columns, "ctrl/elbow": np.full(51, np.nan)})
     with pytest.raises(ValueError, match="ctrl/elbow"):
         find_gap(spec(), [broken, recordings[1]])
+
+
+def test_a_model_of_which_nothing_may_be_refitted_is_refused():
+    body = "<body><joint name='hinge'/><geom size='0.1'/></body>"
+    xml = f"<mujoco><option integrator='RK4'/><worldbody>{body}</worldbody></mujoco>"
+    time = np.arange(200) / 100
+    log = Recording(time, {"qpos/hinge": 0.1 * np.sin(time)})
+    with pytest.raises(ValueError, match="nothing of the model may be refitted"):
+        find_gap(mujoco.MjSpec.from_string(xml), [log, log])
+
+
+def test_a_column_that_shows_nothing_and_a_recording_with_a_twin_are_no_obstacle():
+    """One recording of each half: a bootstrap over recordings alone would be sure of what it says."""
+    logs = record(lambda q, v: np.zeros(2), np.random.default_rng(3), count=2)
+    logs = [replace(r, columns={**r.columns, "site/tip/y": np.zeros(len(r))}, name="log") for r in logs]
+    effects = [EFFECTS["coulomb_friction"]]
+    gap = find_gap(spec(), logs, effects=effects)
+    assert gap.verdict == "none"
+    assert {r.name for r in (*gap.data.fitted_recordings, *gap.data.held_out_recordings)} == {"log", "log (2)"}
+    low, high = gap.errors.interval95
+    assert low < 0.98 * gap.errors.after < gap.errors.after < 0.98 * high
 
 
 def test_one_recording_is_split_in_time_and_said_to_be(friction_gap):

@@ -88,6 +88,17 @@ def test_without_any_of_an_effect_every_column_is_as_without_its_structure(arm, 
         np.testing.assert_allclose(simulated, expected, atol=5e-3 if name in _SOFT else 3e-4)
 
 
+def test_how_far_an_armature_may_move_does_not_depend_on_what_other_drives_push():
+    wrist = '<body><joint name="ball" type="ball"/><geom size="0.1"/></body></worldbody>'
+    drive = '<actuator><orientation name="wrist" joint="ball" kp="3"/>'  # three forces, each with its gear
+    geared = MODEL.replace('kv="3"', 'kv="3" gear="5"')
+    stds = []
+    for xml in (geared, geared.replace("</worldbody>", wrist).replace("<actuator>", drive)):
+        prior = plain_parameters(mujoco.MjSpec.from_string(xml)).prior
+        stds.append(float(prior.std[prior.space.index("armature.elbow")]))
+    assert stds[0] == stds[1] == pytest.approx(np.hypot(0.1 * 0.01, 0.002 * (0.2 + 3 * 5**2)))
+
+
 def test_effects_can_be_tried_where_nothing_moves_or_is_measured():
     finger = '<body><joint name="finger" type="slide" stiffness="1e6"/><geom size="0.01" contype="0"/></body>'
     plain = plain_parameters(mujoco.MjSpec.from_string(MODEL.replace("<site", f"{finger}<site")))
@@ -187,6 +198,41 @@ def test_a_fit_counts_a_spring_in_a_joint_by_how_much_it_gives(arm):
     assert hypothesis.low[column] <= neutral[column] + 1e-9 < probe[column] < hypothesis.high[column]
     np.testing.assert_allclose(hypothesis.coordinates(hypothesis.xi(probe[None]))[0], probe, atol=1e-9)
     assert hypothesis.xi((neutral - 1.0)[None])[0, column] == rigid
+
+
+@pytest.mark.parametrize("name", ["sensor_bias", "sensor_delay", "sensor_scale"])
+def test_a_joint_a_sensor_and_a_site_may_have_one_name(name):
+    sensor = "<sensor><framepos name='elbow' objtype='site' objname='elbow'/></sensor>"
+    spec = mujoco.MjSpec.from_string(MODEL.replace("tip", "elbow").replace("</mujoco>", sensor + "</mujoco>"))
+    plain = plain_parameters(spec)
+    candidates = [Candidate(EFFECTS[name], p) for p in EFFECTS[name].places(plain.model) if p.endswith(":elbow")]
+    rng = np.random.default_rng(0)
+    hypothesis = Hypothesis(plain, candidates, motion_of(plain.model, record(lambda q, v: np.zeros(2), rng)))
+    assert len(candidates) >= 2
+    assert set(map(len, hypothesis.columns.values())) == {len(c.parameters(plain.model)) for c in candidates}
+
+
+def test_a_prior_with_correlations_holds_a_fit_to_them(arm):
+    """Of two parameters that go together in p(ξ), the data pull one; the other goes with it."""
+    plain, motion, _ = arm
+    names = ["mass.upper", "mass.lower"]
+    near = plain.prior.marginal(names)
+    covariance = near.covariance * np.array([[1, 0.99], [0.99, 1]])
+    alike = Plain.of(plain.spec, Gaussian(near.space, near.mean, covariance))
+    hypothesis = Hypothesis(alike, (), motion)
+    xi = np.tile(hypothesis.space.nominal, (3, 1))
+    xi[1, :2], xi[2, :2] = (1.2, 1.2), (1.2, 1 / 1.2)
+    u = hypothesis.coordinates(xi)
+    np.testing.assert_allclose(hypothesis.xi(u), xi)
+    off = np.log(1.2) / near.std[0]
+    np.testing.assert_allclose(hypothesis.off(u)[1:, :2], [[off, off], [off, -off]])
+    penalty = np.sum(u[:, :2] ** 2, axis=1)
+    precision = np.linalg.inv(covariance)
+    log = np.log(xi[:, :2])
+    np.testing.assert_allclose(penalty, np.einsum("ni,ij,nj->n", log, precision, log), atol=1e-9)
+    free = Hypothesis(Plain.of(plain.spec, near), (), motion)
+    np.testing.assert_array_equal(free.off(u), u)
+    assert np.all(np.abs(hypothesis.low[:2]) == FARTHEST)
 
 
 def test_a_plain_parameter_goes_no_farther_than_its_prior_has_it_and_an_effect_is_free(arm):

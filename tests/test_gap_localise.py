@@ -108,6 +108,23 @@ def test_a_gap_in_one_of_three_recordings_does_not_hide_itself():
     assert abs(rows["qpos/c"].z) < 3
 
 
+@pytest.mark.parametrize("drive", ["", "timeconst='0.1'"])
+def test_the_load_is_what_a_drive_gives_by_what_it_was_told_before(drive):
+    model = mujoco.MjModel.from_xml_string(SLIDER.replace('kv="20"', f'kv="20" {drive}'))
+    data, rows = mujoco.MjData(model), []
+    for i in range(200):
+        data.ctrl[0] = 0.5 * np.sin(0.02 * i)
+        mujoco.mj_forward(model, data)
+        rows.append([data.ctrl[0], data.qpos[0], data.qfrc_actuator[0]])
+        mujoco.mj_step(model, data)
+    command, position, force = np.array(rows).T
+    log = Recording(0.005 * np.arange(200), {"ctrl/drive": command, "qpos/slide": position})
+    windows = cut_windows(model, log, seconds=0.2)
+    around = circumstances(model, windows)
+    told = np.interp(around.time[:, 5:-5], 0.005 * np.arange(200) - windows.start_time[0], force)
+    np.testing.assert_allclose(around.load[:, 5:-5, 0], told, atol=0.1 * np.abs(force).max())
+
+
 def test_reversals_holds_and_steps():
     around = sliding(windows=1, samples=100)
     still = Circumstances(**{**vars(around), "velocity": np.where(around.time[..., None] < 0.5, 0.0, around.velocity)})

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 from conftest import needs_effects
-from gap_plant import MODEL, record
+from gap_plant import MODEL, halves, record
 from scipy.stats import multivariate_normal
 
 from simopt_envs.gap.fit import Fit
@@ -16,7 +16,6 @@ from simopt_envs.gap.hypothesis import Candidate
 from simopt_envs.gap.motion import motion_of
 from simopt_envs.gap.plain import plain_parameters
 from simopt_envs.gap.predictive import HeldOut, precision
-from simopt_envs.gap.recordings import read_windows
 from simopt_envs.gap.search import Search
 from simopt_envs.gap.thresholds import EXPLAINED
 from simopt_envs.gap.trial import Base
@@ -29,7 +28,7 @@ def fitted(friction: float, windows: int) -> Base:
     """The model, which lacks some friction of the elbow, fitted to so many windows."""
     recordings = record(lambda q, v: np.array([0.0, -friction * np.tanh(v[1] / 0.01)]), np.random.default_rng(0))
     plain = plain_parameters(mujoco.MjSpec.from_string(MODEL))
-    data = read_windows(plain.model, recordings)
+    data = halves(plain.model, recordings)
     some = replace(data, fitted=data.fitted.select(np.arange(windows)))
     candidates = (Candidate(EFFECTS["coulomb_friction"], "joint:elbow"),)
     return Search(plain, some, motion_of(plain.model, recordings), candidates).base()

@@ -45,6 +45,7 @@ def windows():
         past_commands=np.zeros((WINDOWS, 1, 0)),
         starts=States(*(np.zeros((WINDOWS, 2)) for _ in range(5))),
         stride=1,
+        rounding=np.zeros(2),
     )
 
 

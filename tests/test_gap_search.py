@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 from conftest import needs_effects
-from gap_plant import MODEL, Law, record
+from gap_plant import MODEL, Law, halves, record
 
 from simopt_envs.engine import LocalEngine
 from simopt_envs.gap import fit as fits
@@ -20,7 +20,6 @@ from simopt_envs.gap.fit import CONFIRMING, DIFFERENCES, Misfit
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
 from simopt_envs.gap.motion import motion_of
 from simopt_envs.gap.plain import plain_parameters
-from simopt_envs.gap.recordings import read_windows
 from simopt_envs.gap.refit import Refit, grown
 from simopt_envs.gap.screen import made_by_probes, screen
 from simopt_envs.gap.search import Search
@@ -45,7 +44,7 @@ ONE_SIDED = Candidate(EFFECTS["asymmetric_friction"], "joint:elbow")
 def _search(forces: Law, candidates: Sequence[Candidate], limit: float | None = None) -> Search:
     plain = plain_parameters(mujoco.MjSpec.from_string(MODEL))
     recordings = record(forces, np.random.default_rng(0), limit=limit)
-    return Search(plain, read_windows(plain.model, recordings), motion_of(plain.model, recordings), candidates)
+    return Search(plain, halves(plain.model, recordings), motion_of(plain.model, recordings), candidates)
 
 
 def _off(search: Search, base: Base) -> Array:

@@ -152,7 +152,10 @@ def test_no_further_effect_is_looked_for_where_none_could_be_chosen(removed, lef
     u, errors = np.array([farthest, 2.0, -farthest, 2.5, 0.3]), np.full((40, 50, 2), np.sqrt(1 + left))
     told = HeldOut(errors, np.zeros((*errors.shape, 5)), np.zeros(40))
     fit = Fit(u, errors, np.zeros((errors.size, 5)), np.ones(5), np.zeros(40))
-    hypothesis, noise = SimpleNamespace(num_plain=4), Noise.of(np.ones(2), np.zeros((1, *errors.shape)))
+    hypothesis, noise = (
+        SimpleNamespace(num_plain=4, off=lambda u: u),
+        Noise.of(np.ones(2), np.zeros((1, *errors.shape))),
+    )
     base = Base(cast(Any, hypothesis), fit, told, noise, noise, np.ones(2))
     null: Any = SimpleNamespace(excess=left + removed)
     assert is_all(null, base) is whole

@@ -13,6 +13,7 @@ import pytest
 from conftest import needs_effects
 from gap_plant import MODEL, record
 from hanging import LOOSE, a_rope, drive, hanging, part, swing
+from scipy.ndimage import gaussian_filter1d
 
 from simopt_envs.gap import find, find_gap, wild_starts
 from simopt_envs.gap.fit import Misfit, by_part
@@ -20,7 +21,7 @@ from simopt_envs.gap.hypothesis import Candidate, Hypothesis
 from simopt_envs.gap.motion import motion_of
 from simopt_envs.gap.outliers import without_outliers
 from simopt_envs.gap.plain import Plain, plain_parameters
-from simopt_envs.gap.recordings import longer_windows, read_windows
+from simopt_envs.gap.recordings import longer_windows, read_windows, split
 from simopt_envs.gap.search import Search
 from simopt_envs.gap.thresholds import LARGE, WILD
 from simopt_envs.gap.trial import Base, Data
@@ -107,6 +108,46 @@ def test_longer_windows_are_whole_recordings_of_at_most_four_seconds_their_halve
     assert [24 * len(d.fitted) for d in longer] == [len(data.fitted) * n for n in (4, 8, 12)]
     one = longer_windows(model, read_windows(model, [part(r, r.time < 3.51) for r in recordings]))
     assert [d.seconds for d in one] == pytest.approx([3.5, 1.74, 1.16])
+
+
+def test_what_is_held_out_moves_neither_fastest_nor_slowest():
+    """Joints that stand still show noise alone, which is no speed, and what is missing now and then none either."""
+    time, rng = np.arange(300) / 100, np.random.default_rng(0)
+    moving = {"fast": (6.0, 6.0), "mid": (3.0, 3.0), "brisk": (4.0, 3.0), "one": (3.0, 0.0), "slow": (1.0, 0.5)}
+    recordings = []
+    for name, rates in moving.items():
+        positions = [np.sin(rate * time) + 1e-3 * rng.standard_normal(300) for rate in rates]
+        positions[1][::2] = np.nan
+        recordings.append(Recording(time, {f"qpos/{i}": values for i, values in enumerate(positions)}, name))
+    for order in (recordings, recordings[::-1]):
+        fitted, held_out, _ = split(order)
+        assert {r.name for r in held_out} == {"mid", "brisk"} or {r.name for r in held_out} == {"brisk", "one"}
+        assert {"fast", "slow"} <= {r.name for r in fitted}
+
+
+@needs_effects
+def test_an_encoder_that_stands_on_one_count_is_as_noisy_as_its_rounding():
+    count, rng = 2 * np.pi / 4096, np.random.default_rng(0)
+    plain = plain_parameters(mujoco.MjSpec.from_string(MODEL))
+    still = [replace(r, time=10 * r.time) for r in record(lambda q, v: np.zeros(2), rng)]  # slow beside its samples
+    joints = ("qpos/shoulder", "qpos/elbow")
+    logs = []
+    for log in (r.resample(0.02) for r in still):
+        smooth = {name: count * np.round(gaussian_filter1d(log[name], 25) / count) for name in joints}
+        logs.append(replace(log, columns={**log.columns, **smooth}).only([*log.commands, *joints]))
+    windows = read_windows(plain.model, logs).fitted
+    assert windows.rounding == pytest.approx(count / np.sqrt(12))
+    hypothesis = Hypothesis(plain, (), motion_of(plain.model, logs))
+    floor = Misfit(hypothesis, windows).noise_floor(hypothesis.neutral())
+    assert np.all((floor >= 0.99 * windows.rounding) & (floor < 3 * windows.rounding))
+
+
+@needs_effects
+def test_a_joint_whose_position_no_column_tells_is_told():
+    model = mujoco.MjModel.from_xml_string(MODEL)
+    seen = [r.only([*r.commands, "qpos/shoulder"]) for r in record(lambda q, v: np.zeros(2), np.random.default_rng(0))]
+    told = [w.message for w in read_windows(model, seen).warnings if w.channel == "qpos/elbow"]
+    assert told == ["no column tells where it is: it starts at the model's reference"]
 
 
 @needs_effects

@@ -77,7 +77,8 @@ class Gap:
             for log in logs
             for recording in load_recordings(log, self.mapping)
         ]
-        require_free(self.out, resume=False)
+        if not (self.out / _FITS).exists():  # a run that was stopped goes on, wherever it was
+            require_free(self.out)
         model: str | mujoco.MjSpec = self.model
         keyframe, plain = self.keyframe, None
         if self.model in gym.registry:

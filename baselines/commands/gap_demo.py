@@ -19,7 +19,7 @@ from simopt_envs.adaptation import EnvSimulator, SimOpt
 from simopt_envs.adaptation.records import Iteration
 from simopt_envs.distributions import Gaussian
 from simopt_envs.physics import ParameterSpace
-from simopt_envs.physics.effects import object_name
+from simopt_envs.physics.effects import EFFECTS
 from simopt_envs.report import Details
 from simopt_envs.tasks.effects import with_effects
 
@@ -135,7 +135,7 @@ def _joined(prior: Gaussian, space: ParameterSpace, effects: list[dict[str, Any]
         full_name: fitted["interval95"]
         for entry in effects
         for name, fitted in entry["parameters"].items()
-        if (full_name := f"{entry['effect']}.{object_name(entry['where'])}.{name}") in space
+        if (full_name := EFFECTS[entry["effect"]].full_name(entry["where"], name)) in space
     }
     added = space.subset(list(ends))
     low, high = (added.to_unconstrained(np.clip(end, added.low, added.high)) for end in np.transpose([*ends.values()]))

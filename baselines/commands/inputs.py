@@ -120,14 +120,14 @@ def make_trainer(name: Literal["torch", "sb3"], on_progress: Any = None) -> Trai
     return TorchPPO(on_progress=on_progress)
 
 
-def require_free(directory: Path, resume: bool) -> None:
-    """FileExistsError if an output folder holds anything that is not a run to resume."""
+def require_free(directory: Path, resume: bool | None = None) -> None:
+    """FileExistsError if an output folder holds anything that is not a run to resume; None where none can be."""
     if directory.exists() and not directory.is_dir():
         raise FileExistsError(f"{directory} is a file; --out names a folder")
     held = sorted(p.name for p in directory.iterdir() if not p.name.startswith(".")) if directory.exists() else []
     if held and not (resume and "run.json" in held):
         listed = ", ".join(held[:4]) + (" ..." if len(held) > 4 else "")
-        advice = "choose another folder" if resume else "choose another folder, or add --resume to go on with its run"
+        advice = "choose another folder" + (", or add --resume to go on with its run" if resume is False else "")
         raise FileExistsError(f"{directory} is not empty ({listed}); {advice}")
 
 

@@ -46,7 +46,7 @@ class Inspect:
 
         existing_logs([self.log])
         if self.out is not None:
-            require_free(self.out, resume=False)
+            require_free(self.out)
         inspection = inspect_log(self.log, self.model, self.mapping, self.out)
         print(inspection)
         if not inspection.ok:
@@ -74,5 +74,5 @@ class Replay:
         """Replay and print the errors; ``typed`` is the command line."""
         from simopt_envs.measured import replay_log
 
-        require_free(self.out, resume=False)
+        require_free(self.out)
         print(replay_log(self.model, existing_logs(self.data), self.mapping, self.out, self.window, self.keyframe))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_opening
 
 from simopt_envs.measured.channels import Channel, actuator_names
+from simopt_envs.measured.engines import settle_actuators
 from simopt_envs.measured.smoothing import smooth
 from simopt_envs.measured.windows import Windows, simulate_windows
 from simopt_envs.physics.effects import object_name
@@ -107,7 +107,7 @@ def circumstances(model: mujoco.MjModel, windows: Windows) -> Circumstances:
                     qvel[w, known, d] = smoothed.velocity[known]
                     qacc[w, known, d] = smoothed.acceleration[known]
     command = np.concatenate([windows.commands, windows.commands[:, -1:]], axis=1)[:, :: windows.stride]
-    load, contact = _forces(model, qpos, qvel, command)
+    load, contact = _forces(model, windows, qpos, qvel)
     begins = {
         name: min(t for t, of in zip(windows.start_time, windows.recording, strict=True) if of == name)
         for name in windows.recording
@@ -139,22 +139,21 @@ def _simulated_states(model: mujoco.MjModel, windows: Windows) -> tuple[Array, A
     return states[..., : model.nq].copy(), states[..., model.nq :].copy()
 
 
-def _forces(model: mujoco.MjModel, qpos: Array, qvel: Array, command: Array) -> tuple[Array, Mask]:
+def _forces(model: mujoco.MjModel, windows: Windows, qpos: Array, qvel: Array) -> tuple[Array, Mask]:
     """The load (w, S, nv), see :class:`Circumstances`, and whether anything touches (w, S)."""
-    model = copy.copy(model)
-    if model.nhistory:
-        model.actuator_delay[:] = 0.0  # the commands are those in force
     data = mujoco.MjData(model)
-    load, contact = np.empty(qvel.shape), np.empty(qvel.shape[:2], dtype=bool)
-    driven = np.zeros(model.nv, dtype=bool)
-    for at in np.ndindex(qvel.shape[:2]):
-        data.qpos[:], data.qvel[:], data.ctrl[:] = qpos[at], qvel[at], command[at]
+    drive, bias = np.empty((2, *qvel.shape))
+    contact = np.empty(qvel.shape[:2], dtype=bool)
+    commands = np.concatenate([windows.past_commands, windows.commands, windows.commands[:, -1:]], axis=1)
+    past = windows.past_commands.shape[1]
+    for at in np.ndindex(contact.shape):
+        window, step = at[0], at[1] * windows.stride
+        data.qpos[:], data.qvel[:] = qpos[at], qvel[at]
+        settle_actuators(model, data, commands[window, step : step + past])
+        data.ctrl[:] = commands[window, step + past]
         mujoco.mj_forward(model, data)
-        load[at], contact[at] = data.qfrc_actuator, data.ncon > 0
-        driven |= data.qfrc_actuator != 0
-        if not driven.all():
-            load[at] = np.where(driven, data.qfrc_actuator, data.qfrc_bias)
-    return load, contact
+        drive[at], bias[at], contact[at] = data.qfrc_actuator, data.qfrc_bias, data.ncon > 0
+    return np.where(np.any(drive != 0, axis=(0, 1)), drive, bias), contact
 
 
 def _at_its_stops(model: mujoco.MjModel, joints: Sequence[str], position: Array) -> Mask:

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from simopt_envs.gap.hypothesis import Hypothesis
+from simopt_envs.gap.thresholds import MOVING, WINDOW
 from simopt_envs.measured.replay import start_sensitivity
 from simopt_envs.measured.windows import Windows
 from simopt_envs.physics.parameters import Array
 
 _RESAMPLES = 2000
-_MOVING = 3.0  # a channel moves if its standard deviation is so many times its noise
 _DIVERGED = 10.0  # standard deviations of its channel that a sample counts for which a simulation did not reach
 
 
@@ -24,7 +24,7 @@ class Errors:
     Attributes:
         before, refit, after: of the model as given, with its plain parameters refitted, and repaired.
         noise_floor: what the noise of the sensors and of the estimated starts leaves a right model with.
-        interval95: of ``after``, by bootstrap over recordings.
+        interval95: of ``after``, by bootstrap over recordings or, of one alone, over its half seconds.
         intervals: of all three, in their order.
         simulated: what each predicts, (w, S, c).
     """
@@ -54,30 +54,33 @@ def held_out_errors(
         rng: for the bootstrap.
     """
     scale = windows.channel_scale()
-    moving = scale > _MOVING * noise  # a channel that shows noise alone says nothing
+    moving = scale > MOVING * noise  # a channel that shows noise alone says nothing
     if not moving.any():
         raise ValueError(f"nothing moves in the recordings held out: {', '.join(windows.names)} show noise alone")
+    names, parts = np.array(windows.recording), 1
+    groups = [np.flatnonzero(names == name) for name in dict.fromkeys(windows.recording)]
+    if len(groups) == 1:  # half seconds stand for recordings
+        parts = max(1, round(windows.seconds / WINDOW))
+        groups = list(np.arange(parts * len(windows))[:, None])
     simulated, squares = [], []
     for hypothesis, xi in models:
         predicted = hypothesis.simulator(windows)(xi[None])[0]
-        relative = (predicted - windows.measured) / scale
         diverged = np.isnan(predicted) & np.isfinite(windows.measured)
-        relative = np.where(diverged, _DIVERGED, relative)
+        off = np.where(diverged, _DIVERGED * scale, predicted - windows.measured)
         simulated.append(predicted)
-        squares.append(_mean(relative[..., moving] ** 2))
-    per_window = np.array(squares)  # (3, w, c)
-    names = np.array(windows.recording)
-    groups = [np.flatnonzero(names == name) for name in dict.fromkeys(windows.recording)]
-    values = np.sqrt(np.mean(per_window, axis=(1, 2)))
+        stretches = np.array_split((off[..., moving] / scale[moving]) ** 2, parts, axis=1)
+        squares.append(np.concatenate([_mean(stretch) for stretch in stretches]))
+    per_stretch = np.array(squares)  # (3, w parts, c)
+    values = np.sqrt(np.mean(per_stretch, axis=(1, 2)))
     drawn = rng.integers(len(groups), size=(_RESAMPLES, len(groups)))
     resampled = [
-        np.sqrt(np.mean(per_window[:, np.concatenate([groups[g] for g in draw])], axis=(1, 2))) for draw in drawn
+        np.sqrt(np.mean(per_stretch[:, np.concatenate([groups[g] for g in draw])], axis=(1, 2))) for draw in drawn
     ]
     low, high = np.quantile(resampled, [0.025, 0.975], axis=0)
     hypothesis, xi = models[-1]
     simulator = hypothesis.simulator(windows)
     starts = np.nan_to_num(start_sensitivity(hypothesis.model, simulator, xi[None], simulated[-1]))
-    floor = np.sqrt(np.mean(((noise**2 + np.sum(starts**2, axis=0)) / scale**2)[..., moving]))
+    floor = np.sqrt(np.mean((noise**2 + np.sum(starts**2, axis=0))[..., moving] / scale[moving] ** 2))
     before, refit, after = map(float, values)
     return Errors(
         before,

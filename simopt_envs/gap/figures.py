@@ -18,6 +18,7 @@ from matplotlib.ticker import StrMethodFormatter
 
 from simopt_envs.gap.curves import Curve
 from simopt_envs.gap.localise import EVERYWHERE, SIGNIFICANT, Row
+from simopt_envs.gap.thresholds import MOVING
 from simopt_envs.measured.windows import Windows
 from simopt_envs.physics.parameters import Array
 from simopt_envs.report.figures import BLUE, GREEN, GREY, INK, ORANGE, styled
@@ -25,7 +26,6 @@ from simopt_envs.report.figures import BLUE, GREEN, GREY, INK, ORANGE, styled
 _WIDTH = 10.0  # inches
 _MOST_PARTITIONS = 12
 _MOST_CHANNELS = 6
-_MOVING = 3.0  # standard deviations of its noise from which a channel shows motion
 _SHOWN_WINDOWS = 4
 _WIDEST_RATIO = 30.0  # of errors that bars on a linear axis can show
 _STAGES: tuple[tuple[str, dict[str, Any]], ...] = (
@@ -92,7 +92,7 @@ def overlay_figure(windows: Windows, simulated: Sequence[Array], noise: Array) -
         noise: standard deviation of each channel's, (c,).
     """
     refit = np.nan_to_num(np.nanmean((simulated[1] - windows.measured) ** 2, axis=1)) / noise**2
-    moves = windows.channel_scale() > _MOVING * noise
+    moves = windows.channel_scale() > MOVING * noise
     ordered = np.argsort(-refit.max(axis=0) * (moves if moves.any() else 1.0))
     chosen = ordered[: min(_MOST_CHANNELS, int(moves.sum()) or len(moves))]
     figure = Figure(figsize=(_WIDTH, 1.6 * len(chosen) + 0.7), layout="constrained")

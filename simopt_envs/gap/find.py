@@ -264,7 +264,7 @@ def _spec(model: str | Path | mujoco.MjSpec) -> mujoco.MjSpec:
         raise FileNotFoundError(f"there is no model {model}")
     compiled = spec.compile()
     for i, name in zip(commanded_actuators(compiled), actuator_names(compiled), strict=True):
-        spec.actuators[i].name = name
+        spec.actuators[i].name = spec.actuators[i].name or name  # a dead band's part is called as its drive there
     return spec
 
 

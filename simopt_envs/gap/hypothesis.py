@@ -15,12 +15,12 @@ from simopt_envs.gap.plain import INTEGRATION_LEAD, Plain
 from simopt_envs.gap.starts import loads, starts_of
 from simopt_envs.gap.thresholds import FARTHEST
 from simopt_envs.gap.unseen import UnseenJoints
-from simopt_envs.measured.channels import Channel, model_channels
+from simopt_envs.measured.channels import Channel, actuator_names, model_channels
 from simopt_envs.measured.states import States, depends_on_stage
 from simopt_envs.measured.windows import Windows, WindowSimulator
 from simopt_envs.physics.columns import ColumnModel, CommandModel, acts_on_columns
-from simopt_envs.physics.effects import Effect, Motion, object_name
-from simopt_envs.physics.effects.actuators import actuators, command_sources, on_all_parts
+from simopt_envs.physics.effects import Effect, Motion
+from simopt_envs.physics.effects.actuators import command_sources, on_all_parts
 from simopt_envs.physics.effects.joints import on_bearing, scalar_joints
 from simopt_envs.physics.parameters import Array, Parameter, ParameterSpace
 
@@ -39,7 +39,7 @@ class Candidate:
 
     def full_name(self, parameter: str) -> str:
         """What its parameter is called in ξ: ``"coulomb_friction.elbow.frictionloss"``."""
-        return f"{self.effect.name}.{object_name(self.place)}.{parameter}"
+        return self.effect.full_name(self.place, parameter)
 
     def parameters(self, model: mujoco.MjModel) -> tuple[Parameter, ...]:
         """Its parameters as they are called in ξ."""
@@ -49,9 +49,9 @@ class Candidate:
 class Hypothesis:
     """A model with some effects: plain parameters first in ξ, then those of each effect.
 
-    A fit's coordinates u are 0 at the prior's mean and count its standard deviations; an effect's parameters count the
-    probes of their sizes instead, from the value that leaves the model as it was, and those of its shape the steps from
-    one probe's to the next.
+    A fit's coordinates u are 0 at the prior's mean and there independent of one another with a standard deviation of 1,
+    see :meth:`off`; an effect's parameters count the probes of their sizes instead, from the value that leaves the
+    model as it was, and those of its shape the steps from one probe's to the next.
 
     Args:
         plain: the model and its plain parameters.
@@ -85,6 +85,7 @@ class Hypothesis:
         self._centre, self._unit, self._least = nominal.copy(), np.ones(len(nominal)), np.ones(len(nominal))
         self._centre[: self.num_plain] = plain.prior.mean
         self._unit[: self.num_plain] = plain.prior.std
+        self._prior_root = np.linalg.cholesky(plain.prior.correlation)
         for candidate, columns in self.columns.items():
             z = np.array([self._linear(self._probe(candidate, p)) for p in self._probes(candidate)])
             sizes = np.abs(z - nominal)[:, columns]
@@ -96,8 +97,11 @@ class Hypothesis:
                     self._unit[i] = np.median(np.diff(tried))
         self.prior_std = np.full(len(nominal), _FREE)
         self.prior_std[: self.num_plain] = 1.0
-        self.low, self.high = np.sort([self.coordinates(bound) for bound in (self.space.low, self.space.high)], axis=0)
+        bounds = [(self._linear(bound) - self._centre) / self._unit for bound in (self.space.low, self.space.high)]
+        self.low, self.high = np.sort(bounds, axis=0)
         within = np.where(np.arange(len(nominal)) < self.num_plain, FARTHEST, np.inf)
+        if self._is_correlated:  # their bounds are no bounds of u then; ξ is kept within them
+            self.low[: self.num_plain], self.high[: self.num_plain] = -np.inf, np.inf
         self.low, self.high = np.maximum(self.low, -within), np.minimum(self.high, within)
 
     def __repr__(self) -> str:
@@ -109,14 +113,34 @@ class Hypothesis:
 
     def xi(self, u: Array) -> Array:
         """Coordinates (n, d) -> physical values, within the bounds."""
-        z = self._centre + self._unit * u
+        z = self._centre + self._unit * self.off(u)
         xi = self.space.from_unconstrained(z)
         xi[..., self._reciprocal] = 1 / np.maximum(z[..., self._reciprocal], 1 / self.space.high[self._reciprocal])
         return np.clip(xi, self.space.low, self.space.high)
 
     def coordinates(self, xi: Array) -> Array:
         """Physical values (..., d) -> u."""
-        return (self._linear(xi) - self._centre) / self._unit
+        return self.at((self._linear(xi) - self._centre) / self._unit)
+
+    def at(self, off: Array) -> Array:
+        """The u (..., d) that is so far :meth:`off`."""
+        if not self._is_correlated:
+            return off
+        plain = np.linalg.solve(self._prior_root, off[..., : self.num_plain, None])[..., 0]
+        return np.concatenate([plain, off[..., self.num_plain :]], axis=-1)
+
+    def off(self, u: Array) -> Array:
+        """How far u (..., d) is from where it is 0, a plain parameter in standard deviations of its own prior.
+
+        That is u itself, but where p(ξ) has correlations: u counts in directions that are independent in it.
+        """
+        if not self._is_correlated:
+            return u
+        return np.concatenate([u[..., : self.num_plain] @ self._prior_root.T, u[..., self.num_plain :]], axis=-1)
+
+    @property
+    def _is_correlated(self) -> bool:
+        return bool(np.any(np.tril(self._prior_root, -1)))
 
     def _linear(self, xi: Array) -> Array:
         """Physical values (..., d) as laws take them: logarithms of log quantities, reciprocals of reciprocal ones."""
@@ -260,8 +284,7 @@ class HypothesisSimulator:
         self._lead = [i for i, p in enumerate(hypothesis.space) if p.name == INTEGRATION_LEAD]
         self._ahead = [c for c, channel in enumerate(self.windows.channels) if _is_position(hypothesis.model, channel)]
         self._columns = ColumnModel(hypothesis.space, windows.names)
-        drives = [object_name(place) for place in actuators(hypothesis.plain.model)]
-        self._commands = CommandModel(hypothesis.space, drives)
+        self._commands = CommandModel(hypothesis.space, actuator_names(given))
         self._timestep = float(hypothesis.model.opt.timestep)
         self._of_model = [i for i, p in enumerate(hypothesis.space) if not acts_on_columns(p)]
         space = ParameterSpace(hypothesis.space.parameters[i] for i in self._of_model)

@@ -16,7 +16,7 @@ from simopt_envs.physics.effects.effect import object_name
 from simopt_envs.physics.effects.joints import is_slide, scalar_joints
 from simopt_envs.physics.parameters import Parameter, ParameterSpace, Write
 from simopt_envs.physics.spec_writer import keep_inertias
-from simopt_envs.physics.writer import ModelWriter
+from simopt_envs.physics.writer import ModelWriter, actuator_rows
 
 _INERTIAL_STD = 0.10  # relative, of masses, inertias, armature and damping: what a data sheet or CAD is off by
 _GAIN_STD = 0.03
@@ -60,11 +60,20 @@ class Plain:
 
     @classmethod
     def of(cls, spec: mujoco.MjSpec, prior: Gaussian) -> Plain:
-        """Parameters of a user's own, or the current p(ξ)."""
+        """Parameters of a user's own, or the current p(ξ).
+
+        Raises:
+            ValueError: where there are none, or they cannot be written to the model.
+        """
         spec = spec.copy()
         keep_inertias(spec)
         model = spec.compile()
         prior = _with_lead(model, prior)
+        if not len(prior.space):
+            raise ValueError(
+                "nothing of the model may be refitted, so that all that data differ in would be called missing: give"
+                " its bodies and actuators names in the MJCF, or declare plain parameters"
+            )
         ModelWriter(model, ParameterSpace(p for p in prior.space if not acts_on_columns(p)))  # raises where it cannot
         return cls(spec, model, prior)
 
@@ -149,7 +158,8 @@ def _numerical_inertia(model: mujoco.MjModel, dof: int) -> float:
         (model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT))
         & (model.jnt_dofadr[model.actuator_trnid[:, 0]] == dof)
     )
-    damping = model.dof_damping[dof] - np.sum(model.actuator_biasprm[drives, 2] * model.actuator_gear[drives, 0] ** 2)
+    gears = model.actuator_gear[actuator_rows(model, "out")[0][drives], 0]
+    damping = model.dof_damping[dof] - np.sum(model.actuator_biasprm[drives, 2] * gears**2)
     return float(model.opt.timestep * max(damping, 0.0))
 
 

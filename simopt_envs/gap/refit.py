@@ -19,6 +19,7 @@ from simopt_envs.gap.screen import Screened
 from simopt_envs.gap.thresholds import FAR, LARGE
 from simopt_envs.gap.trial import Base, Trial
 from simopt_envs.measured.windows import Windows
+from simopt_envs.physics.effects import object_name
 from simopt_envs.physics.parameters import Array
 
 ITERATIONS = 20
@@ -149,11 +150,12 @@ def spoken_for(base: Base, candidates: Sequence[Candidate]) -> dict[Candidate, A
 
     Each with the base's coordinates (d,), but those parameters at their priors' means.
     """
-    plain = base.hypothesis.num_plain
-    starts: dict[Candidate, Array] = {}
-    for i in np.flatnonzero(np.abs(base.fit.u[:plain]) > FAR):
-        kind, _, name = base.hypothesis.space.names[i].partition(".")
+    hypothesis = base.hypothesis
+    off = hypothesis.off(base.fit.u)
+    back: dict[Candidate, Array] = {}
+    for i in np.flatnonzero(np.abs(off[: hypothesis.num_plain]) > FAR):
+        kind, _, name = hypothesis.space.names[i].partition(".")
         for c in candidates:
-            if c.effect.name == SPEAKS_FOR.get(kind) and c.place.endswith(name):
-                starts.setdefault(c, base.fit.u.copy())[i] = 0.0
-    return starts
+            if c.effect.name == SPEAKS_FOR.get(kind) and name in ("", object_name(c.place)):
+                back.setdefault(c, off.copy())[i] = 0.0
+    return {candidate: hypothesis.at(values) for candidate, values in back.items()}

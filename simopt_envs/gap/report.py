@@ -206,12 +206,13 @@ def plain(gap: Gap) -> Section:
     d = hypothesis.num_plain
     mean = hypothesis.xi(np.zeros((1, d)))[0]
     refit, repaired = hypothesis.xi(null.fit.u[None])[0], final.hypothesis.xi(final.fit.u[None])[0]
-    moved = np.maximum(np.abs(null.fit.u[:d]), np.abs(final.fit.u[:d]))
+    off = null.hypothesis.off(null.fit.u), final.hypothesis.off(final.fit.u)
+    moved = np.max(np.abs([off[0][:d], off[1][:d]]), axis=0)
     cells = [
         (
             hypothesis.space.names[i],
             f"{mean[i]:.4g}",
-            *(f"{values[i]:.4g} ({u[i]:+.1f})" for values, u in ((refit, null.fit.u), (repaired, final.fit.u))),
+            *(f"{values[i]:.4g} ({sds[i]:+.1f})" for values, sds in zip((refit, repaired), off, strict=True)),
             hypothesis.space.units[i],
         )
         for i in np.argsort(-moved)

@@ -118,7 +118,7 @@ def is_all(null: Base, base: Base) -> bool:
     What is left may be noise alone, and taking as much as one must would leave less than noise does. No plain parameter
     speaks for one, nor do all of them together.
     """
-    plain, noise = base.fit.u[: base.hypothesis.num_plain], noise_alone(base)
+    plain, noise = base.hypothesis.off(base.fit.u)[: base.hypothesis.num_plain], noise_alone(base)
     quiet = base.excess < noise and not base.strained and bool(np.all(np.abs(plain) < FAR))
     return quiet and base.excess - FURTHER * (null.excess - base.excess) < -noise
 

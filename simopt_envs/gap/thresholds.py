@@ -128,6 +128,9 @@ CONFOUNDED = 0.9
 WINDOW = 0.5
 """Seconds of a window."""
 
+MOVING = 3.0
+"""Standard deviations of its noise from which a channel shows motion; of one that shows noise alone nothing is told."""
+
 BENT = 0.1
 """Mean square, in units of the sensors' noise, of what uncertain starts do to longer windows beyond the linear, up to
 which these are fitted. By one standard error of the start or two, the latter as if it was quadratic."""
