@@ -21,7 +21,7 @@ from simopt_envs.gap.hypothesis import Candidate, Hypothesis
 from simopt_envs.gap.motion import motion_of
 from simopt_envs.gap.outliers import without_outliers
 from simopt_envs.gap.plain import Plain, plain_parameters
-from simopt_envs.gap.recordings import longer_windows, read_windows, split
+from simopt_envs.gap.recordings import longer_windows, read_windows
 from simopt_envs.gap.search import Search
 from simopt_envs.gap.thresholds import LARGE, WILD
 from simopt_envs.gap.trial import Base, Data
@@ -108,21 +108,6 @@ def test_longer_windows_are_whole_recordings_of_at_most_four_seconds_their_halve
     assert [24 * len(d.fitted) for d in longer] == [len(data.fitted) * n for n in (4, 8, 12)]
     one = longer_windows(model, read_windows(model, [part(r, r.time < 3.51) for r in recordings]))
     assert [d.seconds for d in one] == pytest.approx([3.5, 1.74, 1.16])
-
-
-def test_what_is_held_out_moves_neither_fastest_nor_slowest():
-    """Joints that stand still show noise alone, which is no speed, and what is missing now and then none either."""
-    time, rng = np.arange(300) / 100, np.random.default_rng(0)
-    moving = {"fast": (6.0, 6.0), "mid": (3.0, 3.0), "brisk": (4.0, 3.0), "one": (3.0, 0.0), "slow": (1.0, 0.5)}
-    recordings = []
-    for name, rates in moving.items():
-        positions = [np.sin(rate * time) + 1e-3 * rng.standard_normal(300) for rate in rates]
-        positions[1][::2] = np.nan
-        recordings.append(Recording(time, {f"qpos/{i}": values for i, values in enumerate(positions)}, name))
-    for order in (recordings, recordings[::-1]):
-        fitted, held_out, _ = split(order)
-        assert {r.name for r in held_out} == {"mid", "brisk"} or {r.name for r in held_out} == {"brisk", "one"}
-        assert {"fast", "slow"} <= {r.name for r in fitted}
 
 
 @needs_effects

@@ -9,7 +9,7 @@ from functools import partial
 import mujoco
 import numpy as np
 
-from simopt_envs.gap.thresholds import FROM_REST, LEAST_LEFT, LONG_WINDOW, MOVING, WINDOW
+from simopt_envs.gap.thresholds import FROM_REST, LEAST_LEFT, LONG_WINDOW, WINDOW
 from simopt_envs.gap.trial import Data
 from simopt_envs.measured.audit import audited
 from simopt_envs.measured.channels import model_channels
@@ -17,11 +17,9 @@ from simopt_envs.measured.recording import Finding, Recording, warnings_of, with
 from simopt_envs.measured.replay import unseen_joints
 from simopt_envs.measured.windows import Windows, cut_windows
 from simopt_envs.physics.effects.actuator_delay import LONGEST
-from simopt_envs.physics.parameters import Array
 
 _GUARD = 0.5  # seconds between what is fitted of a single recording and what is held out
 _FITTED = 0.6  # share of a single recording that is fitted
-_STRETCH = 0.1  # s, over which speeds are told
 _JERK = 0.1  # s from rest on, in which what sets off jerks: no smoothed position shows that
 
 
@@ -64,7 +62,7 @@ def split(recordings: Sequence[Recording]) -> tuple[list[Recording], list[Record
             recordings[0].name, "held-out", "one recording only: its later part is held out, in the same motion"
         )
         return [fitted], [replace(held_out, name=f"{held_out.name} (later part)")], (only,)
-    ordered = [recordings[i] for i in np.argsort(-_speeds(recordings), kind="stable")]
+    ordered = sorted(recordings, key=_liveliness, reverse=True)
     within = np.linspace(1, len(ordered) - 2, len(ordered) // 2).round().astype(int).tolist()
     ends = [i for i in range(len(ordered)) if i not in within]
     return [ordered[i] for i in ends], [ordered[i] for i in within], ()
@@ -141,22 +139,12 @@ def longer_windows(model: mujoco.MjModel, data: Data, keyframe: str | None = Non
     return tuple(found)
 
 
-def _speeds(recordings: Sequence[Recording]) -> Array:
-    """Root mean square rate of each recording's signals, in units of their spread in all recordings [1/s].
-
-    Over tenths of a second, less what noise makes of it; of what shows noise alone, none.
-    """
-    squares = np.zeros(len(recordings))
-    for name in recordings[0].signals:
-        known = [np.isfinite(recording[name]) for recording in recordings]
-        values = [recording[name][rows] for recording, rows in zip(recordings, known, strict=True)]
-        spread = np.std(np.concatenate(values))
-        noise = np.sqrt(np.mean(np.concatenate([np.diff(some, n=2) for some in values]) ** 2) / 6)
-        if spread <= MOVING * noise:
-            continue
-        for i, recording in enumerate(recordings):
-            count = max(1, round(recording.duration / _STRETCH)) + 1
-            at = np.linspace(recording.time[0], recording.time[-1], count)
-            rates = np.diff(np.interp(at, recording.time[known[i]], values[i])) / (at[1] - at[0])
-            squares[i] += (np.mean(rates**2) - 2 * (noise / (at[1] - at[0])) ** 2) / spread**2
-    return np.sqrt(np.maximum(squares, 0.0))
+def _liveliness(recording: Recording) -> float:
+    """Root mean square rate of a recording's signals, each by its own spread [1/s]."""
+    rates = []
+    for name in recording.signals:
+        values = recording[name]
+        spread = np.nanstd(values)
+        if spread > 0:
+            rates.append(np.nanmean(np.diff(values) ** 2) / spread**2)
+    return float(np.sqrt(np.mean(rates)) / recording.period) if rates else 0.0
