@@ -99,6 +99,20 @@ def test_how_far_an_armature_may_move_does_not_depend_on_what_other_drives_push(
     assert stds[0] == stds[1] == pytest.approx(np.hypot(0.1 * 0.01, 0.002 * (0.2 + 3 * 5**2)))
 
 
+@pytest.mark.parametrize(("drive", "names"), [("biastype='affine'", ["gain.d", "velocity_gain.d"]), ("", [])])
+def test_gains_are_those_of_drives_that_feed_back(drive, names):
+    """Other numbers than a feedback's may stand where theirs are, as those of muscles."""
+    xml = f"""
+    <mujoco>
+      <worldbody><body name="b"><joint name="j"/><geom size="0.1"/></body></worldbody>
+      <actuator><general name="d" joint="j" gainprm="9" {drive} biasprm="0 -9 -1"/></actuator>
+    </mujoco>"""
+    spec = mujoco.MjSpec.from_string(xml)
+    assert [name for name in plain_parameters(spec).prior.space.names if "gain" in name] == names
+    (width,) = EFFECTS["deadband"].parameters(spec.compile(), "actuator:d")
+    assert width.unit == ("rad" if names else "")
+
+
 def test_effects_can_be_tried_where_nothing_moves_or_is_measured():
     finger = '<body><joint name="finger" type="slide" stiffness="1e6"/><geom size="0.01" contype="0"/></body>'
     plain = plain_parameters(mujoco.MjSpec.from_string(MODEL.replace("<site", f"{finger}<site")))

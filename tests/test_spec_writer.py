@@ -158,11 +158,16 @@ IN_DEGREES = """
       <geom size=".05 .2 .1" type="box" pos=".1 0 0"/>
       <frame euler="0 0 90" pos="1 0 0">
         <frame quat="0.8 0.6 0 0"><site name="tip" pos=".1 .2 .3" euler="10 20 30"/></frame>
+        <site name="rod" type="capsule" fromto="0 0 0 .1 .2 .3" size=".02"/>
       </frame>
       <body name="slider"><joint name="slide" type="slide" ref="0.1" range="-1 1"/><geom size=".1"/></body>
     </body>
+    <body><joint name="ball" type="ball" range="0 60"/><geom size=".1"/></body>
   </worldbody>
-  <actuator><position name="servo" joint="hinge" kp="100" inheritrange="1"/></actuator>
+  <actuator>
+    <position joint="hinge" kp="100" inheritrange="1"/>
+    <position name="servo" joint="hinge" kp="100" inheritrange="1"/>
+  </actuator>
 </mujoco>
 """
 
@@ -174,10 +179,12 @@ def test_degrees_frames_and_inherited_ranges():
     parameters = [
         *EFFECTS["sensor_bias"].parameters(model, "joint:hinge"),
         *EFFECTS["frame_offset"].parameters(model, "site:tip"),
+        Parameter("rod", "m", 0.0, -1.0, 1.0, "linear", (Write("site_pos", "rod", (0,), "add"),)),
+        Parameter("cone", "rad", 0.0, -1.0, 1.0, "linear", (Write("jnt_range", "ball", (1,), "add"),)),
     ]
     slide = EFFECTS["sensor_bias"].parameters(model, "joint:slide")[0]
     space = ParameterSpace([*parameters, Parameter("s", "m", 0.0, -1.0, 1.0, "linear", slide.writes)])
-    xi = np.array([0.1, 0.01, 0.02, 0.03, 0.05])
+    xi = np.array([0.1, 0.01, 0.02, 0.03, 0.04, 0.2, 0.05])
     write_spec(spec, model, space, xi)
     compiled, truth = spec.compile(), written_model(model, space, xi)
     for field in ("qpos0", "qpos_spring", "jnt_range", "site_pos", "site_quat"):

@@ -127,7 +127,7 @@ def error_figure(values: Sequence[float], intervals: Sequence[tuple[float, float
 
     Args:
         values: normalised root-mean-square errors, up to three.
-        intervals: 95 %, by bootstrap over recordings.
+        intervals: 95 %, by bootstrap over recordings or, of one alone, over its half seconds.
         noise_floor: what a right model would have.
     """
     figure = Figure(figsize=(_WIDTH, 0.85 + 0.5 * len(values)), layout="constrained")
@@ -151,7 +151,7 @@ def error_figure(values: Sequence[float], intervals: Sequence[tuple[float, float
     axis.invert_yaxis()
     axis.grid(visible=False, axis="y")
     axis.margins(x=0.12)
-    axis.set_xlabel("normalised RMSE on recordings that no fit saw; bars: 95 % by bootstrap over recordings")
+    axis.set_xlabel("normalised RMSE on recordings that no fit saw; bars: 95 % by bootstrap")
     figure.legend(loc="outside upper right")
     return figure
 

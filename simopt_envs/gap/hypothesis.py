@@ -9,8 +9,8 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from simopt_envs.adaptation.checkpoint import digest
 from simopt_envs.gap.plain import INTEGRATION_LEAD, Plain
 from simopt_envs.gap.starts import loads, starts_of
 from simopt_envs.gap.thresholds import FARTHEST
@@ -239,7 +239,7 @@ class Hypothesis:
 
     def is_built_as(self, other: Hypothesis) -> bool:
         """Whether its model, before parameters are written, is another's to the bit: at neutral it moves alike."""
-        return np.array_equal(_bytes_of(self.model), _bytes_of(other.model))
+        return digest(self.model) == digest(other.model)
 
     def simulator(self, windows: Windows, num_threads: int = 0) -> HypothesisSimulator:
         """A simulator of windows for values of ξ, on one thread per core by default."""
@@ -344,12 +344,6 @@ class HypothesisSimulator:
                 values = self._hypothesis.values(candidate, row)
                 for name, position in candidate.effect.rest(candidate.place, values, self._loads).items():
                     at_xi[:, int(self._model.joint(name).qposadr[0])] += position
-
-
-def _bytes_of(model: mujoco.MjModel) -> NDArray[np.uint8]:
-    out = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
-    mujoco.mj_saveModel(model, None, out)
-    return out
 
 
 def _without_lead(ahead: Array, lead: Array, period: float) -> Array:

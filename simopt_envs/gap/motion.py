@@ -12,6 +12,7 @@ from simopt_envs.measured.engines import settle_actuators
 from simopt_envs.measured.recording import Recording
 from simopt_envs.measured.states import estimate_states
 from simopt_envs.physics.effects import Motion
+from simopt_envs.physics.effects.joints import SCALAR_JOINTS
 
 _SAMPLES = 50  # of each recording
 _LEAST = 1e-6  # share of the largest: a joint that never moved has a range and a speed
@@ -69,6 +70,6 @@ def _from_reference(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
     """Where a posture is along each degree of freedom; for hinges and slides their coordinate."""
     out = np.zeros(model.nv)
     for j in range(model.njnt):
-        if model.jnt_type[j] in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)):
+        if model.jnt_type[j] in SCALAR_JOINTS:
             out[model.jnt_dofadr[j]] = qpos[model.jnt_qposadr[j]]
     return out

@@ -11,7 +11,7 @@ import numpy as np
 from simopt_envs.distributions.gaussian import Gaussian
 from simopt_envs.physics.columns import acts_on_columns
 from simopt_envs.physics.effects.actuator_delay import LONGEST
-from simopt_envs.physics.effects.actuators import actuators
+from simopt_envs.physics.effects.actuators import actuators, affine_bias
 from simopt_envs.physics.effects.effect import object_name
 from simopt_envs.physics.effects.joints import is_slide, scalar_joints
 from simopt_envs.physics.parameters import Parameter, ParameterSpace, Write
@@ -118,12 +118,12 @@ def plain_parameters(spec: mujoco.MjSpec) -> Plain:
             parameters.append(_factor(f"damping.{joint}", Write("dof_damping", joint, operation="scale")))
             std.append(_INERTIAL_STD)
     for drive in drives:
-        bias = model.actuator(drive).biasprm
-        if bias[1]:
+        _, stiffness, damping = affine_bias(model)[model.actuator(drive).id]
+        if stiffness:
             writes = Write("actuator_gainprm", drive, (0,), "scale"), Write("actuator_biasprm", drive, (1,), "scale")
             parameters.append(_factor(f"gain.{drive}", *writes))
             std.append(_GAIN_STD)
-        if bias[2]:
+        if damping:
             parameters.append(_factor(f"velocity_gain.{drive}", Write("actuator_biasprm", drive, (2,), "scale")))
             std.append(_GAIN_STD)
     if drives:
@@ -159,7 +159,7 @@ def _numerical_inertia(model: mujoco.MjModel, dof: int) -> float:
         & (model.jnt_dofadr[model.actuator_trnid[:, 0]] == dof)
     )
     gears = model.actuator_gear[actuator_rows(model, "out")[0][drives], 0]
-    damping = model.dof_damping[dof] - np.sum(model.actuator_biasprm[drives, 2] * gears**2)
+    damping = model.dof_damping[dof] - np.sum(affine_bias(model)[drives, 2] * gears**2)
     return float(model.opt.timestep * max(damping, 0.0))
 
 

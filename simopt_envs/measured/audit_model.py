@@ -9,7 +9,6 @@ import numpy as np
 from scipy import signal
 
 from simopt_envs.measured.channels import (
-    SCALAR_JOINTS,
     Channel,
     actuator_names,
     commanded_actuators,
@@ -19,6 +18,7 @@ from simopt_envs.measured.recording import Finding, Recording
 from simopt_envs.measured.resample import Array
 from simopt_envs.measured.smoothing import Smoothed, smooth
 from simopt_envs.physics.effects.actuators import moments
+from simopt_envs.physics.effects.joints import SCALAR_JOINTS
 from simopt_envs.physics.parameters import unknown_name
 
 LEAST_SAMPLES = 20  # fewer cannot be smoothed, let alone fitted

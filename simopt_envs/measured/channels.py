@@ -34,9 +34,6 @@ class Channel:
     unit: str
 
 
-SCALAR_JOINTS = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE))
-"""Those whose one number's rate is their velocity."""
-
 _SENSOR_UNITS = {
     mujoco.mjtSensor.mjSENS_JOINTVEL: "rad/s",
     mujoco.mjtSensor.mjSENS_GYRO: "rad/s",

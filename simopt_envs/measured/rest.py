@@ -7,7 +7,7 @@ import numpy as np
 
 from simopt_envs.measured.channels import commanded_actuators
 from simopt_envs.measured.resample import Array
-from simopt_envs.physics.effects.actuators import command_sources, moments
+from simopt_envs.physics.effects.actuators import affine_bias, command_sources, moments
 
 _FIXED = int(mujoco.mjtGain.mjGAIN_FIXED)
 _LINEAR = int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)
@@ -32,8 +32,8 @@ def holding_commands(model: mujoco.MjModel, qpos: Array, first: Array) -> Array:
     others = np.setdiff1d(np.arange(len(arms)), commanded)  # as cogging, which acts whatever is told
     held = data.qfrc_inverse - arms[others].T @ data.actuator_force[others]
     needed = np.linalg.lstsq(arms[drives].T, held, rcond=None)[0]
-    gain, offset, stiffness = model.actuator_gainprm[:, 0], model.actuator_biasprm[:, 0], model.actuator_biasprm[:, 1]
-    bias = np.where(model.actuator_biastype == _LINEAR[1], offset + stiffness * data.actuator_length, 0.0)[drives]
+    gain, (offset, stiffness, _) = model.actuator_gainprm[:, 0], affine_bias(model).T
+    bias = (offset + stiffness * data.actuator_length)[drives]
     told = (model.actuator_gaintype == _FIXED) & np.isin(model.actuator_biastype, _LINEAR) & (gain != 0)
     told &= model.actuator_dyntype != _INTEGRATES
     low, high = model.actuator_forcerange[drives].T

@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from simopt_envs.measured.channels import SCALAR_JOINTS, Channel, model_channels, read_channels
+from simopt_envs.measured.channels import Channel, model_channels, read_channels
 from simopt_envs.measured.recording import Recording
 from simopt_envs.measured.resample import Array
 from simopt_envs.measured.smoothing import Smoothed, smooth, smooth_with_rate
+from simopt_envs.physics.effects.joints import SCALAR_JOINTS
 from simopt_envs.physics.parameters import unknown_name
 
 _POSITION_PRIOR = 1.0  # sd of an unmeasured joint around the reference [rad, m]: decides only what nothing sees

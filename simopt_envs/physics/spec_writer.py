@@ -91,6 +91,7 @@ def keep_inertias(spec: mujoco.MjSpec) -> None:
 
 
 _Writer = Callable[[mujoco.MjSpec, _Row], None]
+_TURNING = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_BALL)
 
 
 def _attribute(kind: str, attribute: str, columns: slice = slice(None)) -> _Writer:
@@ -114,7 +115,7 @@ def _position(attribute: str) -> _Writer:
 
     def write(spec: mujoco.MjSpec, row: _Row) -> None:
         joint = spec.joint(row.object)
-        in_degrees = joint.type == mujoco.mjtJoint.mjJNT_HINGE and joint.compiler.degree
+        in_degrees = joint.type in _TURNING and joint.compiler.degree
         values = np.degrees(row.values) if in_degrees else row.values
         setattr(joint, attribute, values if attribute == "range" else float(values[0]))
 
@@ -127,7 +128,7 @@ def _range(spec: mujoco.MjSpec, row: _Row) -> None:
     for drive in spec.actuators:
         if drive.inheritrange and drive.target == row.object:
             drive.inheritrange = 0
-            drive.ctrlrange = row.model.actuator(drive.name).ctrlrange
+            drive.ctrlrange = row.model.actuator(drive.id).ctrlrange
 
 
 def _inertial(spec: mujoco.MjSpec, row: _Row) -> None:
@@ -151,7 +152,11 @@ def _place(kind: str) -> _Writer:
 
     def write(spec: mujoco.MjSpec, row: _Row) -> None:
         element = getattr(spec, kind)(row.object)
-        element.pos = element.pos + _rotation(spec, element.frame).T @ row.change
+        moved = _rotation(spec, element.frame).T @ row.change
+        if np.isfinite(getattr(element, "fromto", np.nan)).all():  # its ends, which tell where it is
+            element.fromto = element.fromto + np.tile(moved, 2)
+        else:
+            element.pos = element.pos + moved
 
     return write
 

@@ -36,6 +36,15 @@ def affine_drives(model: mujoco.MjModel) -> tuple[str, ...]:
     )
 
 
+def affine_bias(model: mujoco.MjModel) -> Array:
+    """The constant of each actuator's bias, and what it has per length and per velocity, (nactuator, 3).
+
+    None where it is of another law, as of muscles, which keep other numbers there.
+    """
+    affine = model.actuator_biastype == int(mujoco.mjtBias.mjBIAS_AFFINE)
+    return np.where(affine[:, None], model.actuator_biasprm[:, :3], 0.0)
+
+
 def driven_joint(model: mujoco.MjModel, actuator: str) -> str | None:
     """The hinge or slide that a drive moves; None where it moves something else, a tendon or a site."""
     drive = model.actuator(actuator)

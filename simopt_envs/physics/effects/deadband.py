@@ -5,7 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from simopt_envs.physics.effects.actuators import DEADBAND, affine_drives, drive_force, driven_joint, gear
+from simopt_envs.physics.effects.actuators import DEADBAND, affine_bias, affine_drives, drive_force, driven_joint, gear
 from simopt_envs.physics.effects.effect import Effect, Motion, object_name
 from simopt_envs.physics.effects.joints import position_unit
 from simopt_envs.physics.parameters import Parameter, Write
@@ -92,8 +92,8 @@ def _error_terms(gain: np.ndarray, bias: np.ndarray) -> np.ndarray:
 def _unit(model: mujoco.MjModel, drive: str) -> str:
     """Of a servo's error; of a motor's command it is not known."""
     joint = driven_joint(model, drive)
-    gain, bias = model.actuator(drive).gainprm, model.actuator(drive).biasprm
-    position, velocity = _error_terms(gain, bias)[1:3] != 0
+    bias = affine_bias(model)[model.actuator(drive).id]
+    position, velocity = _error_terms(model.actuator(drive).gainprm, bias)[1:] != 0
     if joint is None or not (position or velocity):
         return ""
     return position_unit(model, joint) + ("/s" if velocity else "")

@@ -17,13 +17,15 @@ _LEAST_STAGE = 1e-3  # and to every joint behind it, so that the mass matrix is 
 _BEARING = ".bearing"  # what the name of the tendon ends in that has what resists a link behind a transmission
 _RESISTS = {f"dof_{quantity}": f"tendon_{quantity}" for quantity in ("damping", "dampingpoly", "frictionloss")}
 _TENDON = mujoco.mjtObj.mjOBJ_TENDON
-_SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 _MOST_DOFS = 6  # of a body, that MuJoCo takes
+
+SCALAR_JOINTS = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+"""Those whose one number's rate is their velocity."""
 
 
 def scalar_joints(model: mujoco.MjModel) -> tuple[str, ...]:
     """``"joint:NAME"`` of every named hinge and slide."""
-    names = (model.joint(i).name for i in range(model.njnt) if model.jnt_type[i] in _SCALAR)
+    names = (model.joint(i).name for i in range(model.njnt) if model.jnt_type[i] in SCALAR_JOINTS)
     return tuple(f"joint:{name}" for name in names if name)
 
 
