@@ -20,10 +20,11 @@ from simopt_envs.gap.fit import CONFIRMING, DIFFERENCES, Misfit
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
 from simopt_envs.gap.motion import motion_of
 from simopt_envs.gap.plain import plain_parameters
+from simopt_envs.gap.presence import is_there
 from simopt_envs.gap.refit import Refit, grown
 from simopt_envs.gap.screen import made_by_probes, screen
 from simopt_envs.gap.search import Search
-from simopt_envs.gap.selection import is_there, score_of
+from simopt_envs.gap.selection import score_of
 from simopt_envs.gap.thresholds import EVIDENCE, LARGE, PROBED_LARGER
 from simopt_envs.gap.trial import Base
 from simopt_envs.physics.effects import EFFECTS

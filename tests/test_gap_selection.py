@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -13,9 +14,10 @@ from simopt_envs.gap.fit import Fit
 from simopt_envs.gap.hypothesis import Candidate
 from simopt_envs.gap.large import of_several_effects
 from simopt_envs.gap.predictive import HeldOut
+from simopt_envs.gap.presence import is_told_from_none, may_be_itself
 from simopt_envs.gap.recordings import split
 from simopt_envs.gap.result import judge
-from simopt_envs.gap.selection import Score, chosen, is_all, may_be_itself, tolerance_of
+from simopt_envs.gap.selection import Score, chosen, is_all, tolerance_of
 from simopt_envs.gap.trial import Base
 from simopt_envs.measured import Recording
 from simopt_envs.physics.effects import EFFECTS
@@ -83,6 +85,28 @@ def test_an_effect_is_what_its_name_means_if_its_interval_holds_that(width, std,
         is_itself=lambda candidate, u: candidate == effect and u[2] < 1,
     )
     assert may_be_itself(hypothesis, effect, np.array([0.0, 0.5, width]), np.array([9.0, 9.0, std])) is itself
+
+
+@pytest.mark.parametrize(
+    ("size", "pulled", "told"),
+    [
+        (60.0, 0.0, True),  # more of it would change little, and none of it much
+        (60.0, 12.0, False),  # in every other window there seems to be less than none
+        (5.0, 0.0, False),  # it changes as much as the way from none would have it: its interval leaves out none
+    ],
+)
+def test_none_of_an_effect_may_be_far_from_one_so_strong_that_more_changes_little(size, pulled, told):
+    """A motion that friction makes smaller: the speed that is left goes as 1 / (1 + its size)."""
+    effect = Candidate(EFFECTS["viscous_friction"], "joint:elbow")
+    motion = 6.0 * np.sin(np.arange(200.0)).reshape(8, 25, 1)
+    errors = np.random.default_rng(0).standard_normal(motion.shape)
+    errors += pulled / 6 * motion * np.resize([1.0, -1.0], (8, 1, 1))
+    slope = -motion.reshape(-1, 1) / (1 + size) ** 2
+    fit = Fit(np.array([size]), errors, slope, np.array([1e3]), np.zeros(8))
+    none = replace(fit, u=np.zeros(0), errors=errors + motion * size / (1 + size), jacobian=np.zeros((200, 0)))
+    hypothesis = SimpleNamespace(neutral=lambda: np.zeros(1), amounts=lambda _: [0], columns={effect: [0]})
+    base: Any = SimpleNamespace(hypothesis=hypothesis, to_all=lambda: fit, left=1.0)
+    assert is_told_from_none(effect, base, cast(Base, SimpleNamespace(to_all=lambda: none)), parts=1) is told
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from simopt_envs.gap.error import Errors
 from simopt_envs.gap.explanation import Explanation
 from simopt_envs.gap.hypothesis import Candidate
 from simopt_envs.gap.localise import Row
+from simopt_envs.gap.presence import is_there
 from simopt_envs.gap.repair import column_lines, difference, repaired, to_xml_in
 from simopt_envs.gap.thresholds import CONFIDENT, EXPLAINED, LEAST_SHARE
 from simopt_envs.gap.timestep import TIMESTEP
@@ -51,12 +52,14 @@ class Named:
         parameters: its numbers by their short names.
         evidence: nats that it earns beside the others, ``"fitted"`` and ``"held_out"``.
         partners: effects that change these data much as it does.
+        sized: whether what was fitted tells how much of it there is: its interval leaves out none of it.
     """
 
     candidate: Candidate
     parameters: dict[str, Estimate]
     evidence: dict[str, float]
     partners: tuple[Partner, ...]
+    sized: bool = True
 
     def __str__(self) -> str:
         numbers = ", ".join(f"{name} {estimate}" for name, estimate in self.parameters.items())
@@ -99,7 +102,9 @@ class Gap:
     @property
     def remarks(self) -> tuple[str, ...]:
         """What the effects say together."""
-        return tuple(two_directions(self.explanation.null.hypothesis.plain.model, self.effects))
+        said = two_directions(self.explanation.null.hypothesis.plain.model, self.effects)
+        unsized = (str(named.candidate) for named in self.effects if not named.sized)
+        return *said, *(f"Data tell that {name} is there, but hardly how much of it." for name in unsized)
 
     @property
     def warnings(self) -> tuple[Finding, ...]:
@@ -247,6 +252,7 @@ def named_effects(explanation: Explanation) -> tuple[Named, ...]:
             },
             {"fitted": score.fitted, "held_out": score.held_out},
             partners(explanation, score.candidate),
+            is_there(hypothesis, score.candidate, u, spread),
         )
         for score in explanation.effects
     )

@@ -20,9 +20,10 @@ from simopt_envs.gap.large import SECONDS, nearest_size, of_several_effects
 from simopt_envs.gap.outliers import without_outliers
 from simopt_envs.gap.plain import SPEAKS_FOR, Plain
 from simopt_envs.gap.predictive import HeldOut
+from simopt_envs.gap.presence import is_there, is_told_from_none, may_be_itself
 from simopt_envs.gap.refit import ITERATIONS, Refit, extended, fitted, grown, spoken_for
 from simopt_envs.gap.screen import Probed, Screened, fitted_anyway, foretelling, screen
-from simopt_envs.gap.selection import Score, chosen, is_all, is_there, may_be_itself, score_of, tolerance_of, worth_of
+from simopt_envs.gap.selection import Score, chosen, is_all, score_of, tolerance_of, worth_of
 from simopt_envs.gap.thresholds import EVIDENCE, EVIDENCE_EACH, LARGE, LARGE_REFITTED, MOST_EFFECTS, REFITTED_AT_MOST
 from simopt_envs.gap.trial import Base, Data, Trial, afresh
 from simopt_envs.gap.wild_starts import as_predicted, without_starts_told_wild
@@ -338,9 +339,10 @@ class Search:
 
         With it comes what each earns, most first. With and without are compared in one noise, that of the model with
         all: what uncertain starts leave depends on the model too. An effect whose interval, by all windows, holds "none
-        of it" goes as well: the evidence for it is of a few stretches, and others speak against it; so does one that is
-        not what its name means. What did well beside it may take its place, and others then be added. One of which that
-        holds for what it adds to the effect that it extends gives way to that. What was dropped does not come back.
+        of it" goes as well, unless it is so strong that its size shows little: the evidence for it is of a few
+        stretches, and others speak against it. So does one that is not what its name means. What did well beside it may
+        take its place, and others then be added. One of which that holds for what it adds to the effect that it extends
+        gives way to that. What was dropped does not come back.
         """
         effects, earned = base.hypothesis.candidates, []
         if not effects:
@@ -353,7 +355,8 @@ class Search:
                 return self._revised(self._reduced(base, effect, smaller), stages, dropped | {effect})
             without = self._without(base, effect, stages)
             score = score_of(without, effect, base, worth_of(base))
-            stays = score.needed and itself[effect] and is_there(*told)
+            there = is_there(*told) or is_told_from_none(effect, base, without, self.data.parts)
+            stays = score.needed and itself[effect] and there
             rivals = rivals_of(effect, stays, without, stages) - dropped - {*effects}
             if rivals and len(dropped) < MOST_EFFECTS:  # or what is outside the library has one try after another
                 screened = self._screened(without)

@@ -8,11 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from simopt_envs.gap.fit import Fit
-from simopt_envs.gap.hypothesis import Candidate, Hypothesis
+from simopt_envs.gap.hypothesis import Candidate
 from simopt_envs.gap.plain import SPEAKS_FOR
 from simopt_envs.gap.thresholds import (
     COARSE,
-    CONFIDENT,
     EVIDENCE,
     EVIDENCE_EACH,
     EXPLAINED,
@@ -162,27 +161,3 @@ def score_of(base: Base, candidate: Candidate, trial: Trial, worth: Array) -> Sc
     before, after = (t.held_out.surprise(t.precision(weight), worth, t.within) for t in (base, trial))
     held_out = before - after + of_prior
     return Score(candidate, trial, float(fitted), float(held_out), of_prior)
-
-
-def is_there(
-    hypothesis: Hypothesis, effect: Candidate, u: Array, spread: Array, smaller: Candidate | None = None
-) -> bool:
-    """Whether an effect's interval leaves out that there is none of it; a limit, without an amount, that it is none.
-
-    With a smaller one, which it extends: none of what it adds to that.
-    """
-    off = np.abs(u - hypothesis.neutral()) > CONFIDENT * spread
-    columns = hypothesis.amounts(effect) or hypothesis.columns[effect]
-    if smaller is not None:
-        columns = [i for i in hypothesis.added(effect, smaller) if i in columns]
-    return bool(np.any(off[columns]))
-
-
-def may_be_itself(hypothesis: Hypothesis, effect: Candidate, u: Array, spread: Array) -> bool:
-    """Whether an effect is what its name means at some end of its parameters' intervals, if not where the fit ended.
-
-    What data tell little of, as how wide a friction's peak is, may end a little beyond.
-    """
-    steps = CONFIDENT * np.diag(spread)[hypothesis.columns[effect]]
-    ends = np.clip(np.concatenate([u[None], u - steps, u + steps]), hypothesis.low, hypothesis.high)
-    return any(hypothesis.is_itself(effect, end) for end in ends)

@@ -180,23 +180,27 @@ class Base(Trial):
 
     def spread(self, data: Data) -> Array:
         """Standard deviation of u, (d,), by the windows that were fitted."""
-        return np.sqrt(self.fit.variance(self._others(data.fitted, self.noise), self._left, data.parts))
+        return np.sqrt(self.fit.variance(self._others(data.fitted, self.noise), self.left, data.parts))
 
-    def by_all(self, data: Data) -> tuple[Array, Array]:
-        """u by the windows fitted and those held out together, to first order from the fit, and its spread, (d,)."""
+    def to_all(self) -> Fit:
+        """The fit to the windows fitted and those held out together, to first order."""
         weight = 1 / self.tolerance
         errors = np.concatenate([self.fit.errors, weight * self.held_out.errors])
         of_held_out = weight[:, None] * self.held_out.jacobian
         jacobian = np.concatenate([self.fit.jacobian, of_held_out.reshape(-1, len(self.fit.u))])
-        both = (data.fitted, self.noise), (data.held_out, self.held_out_noise)
-        others = [np.concatenate(some) for some in zip(*(self._others(*one) for one in both), strict=True)]
         fit = replace(self.fit, errors=errors, jacobian=jacobian)
         u = fit.u + lsq_linear(fit.rows, -fit.residual, self.within, method="bvls").x
-        stepped = replace(fit, u=u, errors=errors + (jacobian @ (u - fit.u)).reshape(errors.shape))
-        return u, np.sqrt(stepped.variance(others, self._left, data.parts))
+        return replace(fit, u=u, errors=errors + (jacobian @ (u - fit.u)).reshape(errors.shape))
+
+    def by_all(self, data: Data) -> tuple[Array, Array]:
+        """u by the windows fitted and those held out together, and its spread, (d,)."""
+        both = (data.fitted, self.noise), (data.held_out, self.held_out_noise)
+        others = [np.concatenate(some) for some in zip(*(self._others(*one) for one in both), strict=True)]
+        fit = self.to_all()
+        return fit.u, np.sqrt(fit.variance(others, self.left, data.parts))
 
     @property
-    def _left(self) -> float:
+    def left(self) -> float:
         """Mean square of the whitened held-out errors, at least that of noise."""
         return max(1.0, float(np.mean((self.held_out.errors / self.tolerance) ** 2)))
 
