@@ -38,8 +38,8 @@ Since seeds 33000 had, ``WILD`` is asked of sites and sensors as a whole, where 
 cases of the swing-peg of seeds 30000), and fits in full keep derivatives by what hardly shows, for time alone.
 Since seeds 34000 had, ``FROM_REST`` is new.
 Since seeds 37000 had, ``OF_TIMESTEP`` is new (Gymnasium's half cheetah, in recordings of half its timestep in which
-nothing was hidden, had been given four names), and what is so strong that its interval holds none may be told from none all the same
-(``gap/presence.py``; a friction in a rope of the tests, of which no seed has one).
+nothing was hidden, had been given four names), and what is so strong that its interval holds none may be told from none
+all the same (``gap/presence.py``; a friction in a rope of the tests).
 
 What fitted values must be for an effect's name to fit them is with the effects (``Effect.is_itself``): that a cogging
 shows a whole period is asked since seeds 20000 had been run (one case, and one of the gap demonstration).
