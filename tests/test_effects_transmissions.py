@@ -95,6 +95,22 @@ def test_a_link_turns_about_the_axis_of_a_joint_in_a_frame(effect: str, link: st
     np.testing.assert_allclose([behind.axis, behind.pos], [motor.axis, motor.pos], atol=1e-12)
 
 
+@pytest.mark.parametrize("effect", ["backlash", "joint_elasticity", "load_dependent_friction"])
+def test_keyframes_have_all_joints_where_they_were(effect: str) -> None:
+    """What is added comes between the others."""
+    keys = '<keyframe><key qpos="0.1 0.2 0.3" qvel="1 2 3"/><key ctrl="0.5 0 0"/></keyframe></mujoco>'
+    spec = mujoco.MjSpec.from_string(ARM.replace("</mujoco>", keys))
+    for joint in ("shoulder", "elbow"):
+        EFFECTS[effect].add(spec, f"joint:{joint}")
+    for model in (spec.compile(), mujoco.MjModel.from_xml_string(spec.to_xml())):
+        for name, at in (("shoulder", 1.0), ("elbow", 2.0), ("drive", 3.0)):
+            joint = model.joint(name)
+            assert model.key_qpos[0, joint.qposadr[0]] == pytest.approx(0.1 * at)
+            assert model.key_qvel[0, joint.dofadr[0]] == pytest.approx(at)
+        assert np.count_nonzero(model.key_qpos[0]) == np.count_nonzero(model.key_qvel[0]) == 3
+        np.testing.assert_allclose(model.key_qpos[1], model.qpos0)
+
+
 def test_elasticity_and_backlash_can_be_in_series() -> None:
     spec = mujoco.MjSpec.from_string(ARM)
     for name in ("joint_elasticity", "backlash"):

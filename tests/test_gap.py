@@ -11,7 +11,7 @@ import pytest
 from conftest import needs_effects
 from gap_plant import MODEL, record
 
-from simopt_envs.gap import find_gap
+from simopt_envs.gap import find, find_gap
 from simopt_envs.measured import Recording, cut_windows, simulate_windows
 from simopt_envs.physics.effects import EFFECTS
 
@@ -170,6 +170,13 @@ def test_a_column_that_shows_nothing_and_a_recording_with_a_twin_are_no_obstacle
     assert {r.name for r in (*gap.data.fitted_recordings, *gap.data.held_out_recordings)} == {"log", "log (2)"}
     low, high = gap.errors.interval95
     assert low < 0.98 * gap.errors.after < gap.errors.after < 0.98 * high
+
+
+def test_a_recording_that_is_given_twice_counts_once():
+    logs = record(lambda q, v: np.zeros(2), np.random.default_rng(3), count=2)
+    data = find.read(spec(), [*logs, replace(logs[0], name="again")]).data
+    assert {r.name for r in (*data.fitted_recordings, *data.held_out_recordings)} == {"run_0", "run_1"}
+    assert "warning: again: the same as run_0: it counts once (run_0)" in map(str, data.warnings)
 
 
 def test_one_recording_is_split_in_time_and_said_to_be(friction_gap):

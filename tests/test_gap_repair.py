@@ -39,6 +39,16 @@ def test_a_repaired_model_finds_its_meshes_and_textures_from_where_it_is_saved(t
     assert (spec.compiler.meshdir, spec.compiler.texturedir) == ("meshes", "pictures")
 
 
+def test_a_repaired_model_finds_the_sides_of_a_sky(tmp_path):
+    matplotlib.image.imsave(tmp_path / "side.png", np.zeros((4, 4, 3)))
+    sides = " ".join(f'file{side}="side.png"' for side in ("right", "left", "up", "down", "front", "back"))
+    (tmp_path / "model.xml").write_text(f"<mujoco><asset><texture type='skybox' {sides}/></asset></mujoco>")
+    (tmp_path / "out").mkdir()
+    saved = to_xml_in(mujoco.MjSpec.from_file(str(tmp_path / "model.xml")), tmp_path / "out")
+    (tmp_path / "out" / "model.xml").write_text(saved)
+    assert mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "model.xml")).ntex == 1
+
+
 def test_a_repaired_model_without_files_tells_of_no_folder(tmp_path):
     spec = mujoco.MjSpec.from_string("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
     spec.compile()

@@ -228,8 +228,16 @@ INERTIAL = '<body name="lower" pos=".3 0 0"><inertial pos="0 0 0" mass="7" diagi
 
 
 @pytest.mark.filterwarnings("ignore:compiler attribute .settotalmass")
-@pytest.mark.parametrize("compiler", ['inertiafromgeom="true"', 'inertiafromgeom="true" settotalmass="14"'])
-def test_a_compiler_that_infers_or_scales_all_masses_keeps_what_is_written(compiler):
+@pytest.mark.parametrize(
+    "compiler",
+    [
+        'inertiafromgeom="true"',
+        'inertiafromgeom="true" settotalmass="14"',
+        'boundmass="0.6" boundinertia="0.01"',
+        'balanceinertia="true"',
+    ],
+)
+def test_a_compiler_that_infers_or_changes_masses_keeps_what_is_written(compiler):
     """As those of most of Gymnasium's own models do; nothing else of the model changes."""
     given = XML.replace('angle="radian"', f'angle="radian" {compiler}')
     spec = mujoco.MjSpec.from_string(given.replace('<body name="lower" pos=".3 0 0">', INERTIAL))
@@ -241,6 +249,8 @@ def test_a_compiler_that_infers_or_scales_all_masses_keeps_what_is_written(compi
 
 
 def test_a_compiler_that_overrides_what_was_written_is_noticed():
-    spec = mujoco.MjSpec.from_string(XML.replace('angle="radian"', 'angle="radian" boundmass="0.3"'))
-    with pytest.raises(ValueError, match="override what was written to body_mass"):
-        write_spec(spec, spec.compile(), MASS, [0.5])
+    capsule = 'name="lower" type="capsule" size=".02" fromto="0 0 0 .2 0 0"'
+    spec = mujoco.MjSpec.from_string(XML.replace('name="lower" type="box" size=".1 .02 .02" pos=".1 0 0"', capsule))
+    longer = Parameter("length", "1", 1.0, 0.1, 9.0, "log", (Write("geom_size", "lower", (1,), operation="scale"),))
+    with pytest.raises(ValueError, match="overrides what was written to geom_size of lower"):
+        write_spec(spec, spec.compile(), ParameterSpace([longer]), [0.5])

@@ -26,6 +26,8 @@ _JERK = 0.1  # s from rest on, in which what sets off jerks: no smoothed positio
 def of_one_system(model: mujoco.MjModel, recordings: Sequence[Recording]) -> list[Recording]:
     """The recordings, each audited, with what the audit found attached and the model's columns alone.
 
+    One that is there twice counts once: what was fitted must not be held out.
+
     Raises:
         ValueError: without recordings, where the audit found an error, or where recordings are of different models.
     """
@@ -39,10 +41,22 @@ def of_one_system(model: mujoco.MjModel, recordings: Sequence[Recording]) -> lis
                 f"{recording.name} and {recordings[0].name} have different columns ({', '.join(sorted(only))} in one of"
                 " them alone): are they of the same system?"
             )
-    return [
-        audited(recording, model).only([name for name in recording.columns if name in known])
-        for recording in with_distinct_names(recordings)
-    ]
+    logs: list[Recording] = []
+    for recording in with_distinct_names(recordings):
+        log = audited(recording, model).only([name for name in recording.columns if name in known])
+        twin = next((i for i, other in enumerate(logs) if _are_same(log, other)), None)
+        if twin is None:
+            logs.append(log)
+        else:
+            told = Finding.warning(log.name, "recordings", f"the same as {logs[twin].name}: it counts once")
+            logs[twin] = replace(logs[twin], warnings=(*logs[twin].warnings, told))
+    return logs
+
+
+def _are_same(one: Recording, other: Recording) -> bool:
+    """Whether two recordings of the same columns hold the same samples."""
+    columns = ((values, other[name]) for name, values in one.columns.items())
+    return all(np.array_equal(*both, equal_nan=True) for both in ((one.time, other.time), *columns))
 
 
 def under_way(recordings: Sequence[Recording]) -> list[Recording]:

@@ -57,8 +57,8 @@ def _write_delays(spec: mujoco.MjSpec, hypothesis: Hypothesis, xi: Array) -> Non
 
 def to_xml_in(spec: mujoco.MjSpec, folder: Path) -> str:
     """MJCF of a spec to be saved in a folder: from there it finds meshes and textures where they are."""
-    files = (*spec.meshes, *spec.hfields, *spec.skins, *spec.textures)
-    if any(asset.file for asset in files):
+    files = [asset.file for asset in (*spec.meshes, *spec.hfields, *spec.skins, *spec.textures)]
+    if any((*files, *(side for texture in spec.textures for side in texture.cubefiles))):
         spec = spec.copy()
         for kind in ("meshdir", "texturedir"):
             there = Path(spec.modelfiledir, getattr(spec.compiler, kind)).absolute()

@@ -148,7 +148,10 @@ class ParameterSpace:
             return np.where(self.is_log, np.log(x), x)
 
     def from_unconstrained(self, z: ArrayLike) -> Array:
-        """Coordinates -> physical values; the inverse of :meth:`to_unconstrained`."""
+        """Coordinates -> physical values; the inverse of :meth:`to_unconstrained`.
+
+        Bounds do not enter: it is the distributions that keep them, by drawing again what falls outside.
+        """
         z = self._last_axis(z, "coordinates")
         with np.errstate(over="ignore"):
             return np.where(self.is_log, np.exp(z), z)

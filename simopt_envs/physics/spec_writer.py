@@ -45,7 +45,7 @@ def write_spec(spec: mujoco.MjSpec, model: mujoco.MjModel, space: ParameterSpace
 
     Raises:
         ValueError: if a parameter writes a field that a spec cannot hold; nothing has been written then. Also if the
-            spec's compiler does not keep what was written (``boundmass``), naming the field.
+            spec's compiler does not keep what was written (the length of a capsule ``fromto`` its ends), naming it.
     """
     writer = ModelWriter(model, space)
     for field in writer.fields:
@@ -68,24 +68,26 @@ def write_spec(spec: mujoco.MjSpec, model: mujoco.MjModel, space: ParameterSpace
         row = field_elements(model, Write(field, name))
         kept, meant = (model_field(m, field).ravel()[row] for m in (compiled, written))
         if not np.allclose(kept, meant, rtol=1e-9, atol=1e-12):
-            raise ValueError(f"the compiler settings of the model override what was written to {field}")
+            raise ValueError(f"the model's compiler overrides what was written to {field} of {name}")
 
 
 def keep_inertias(spec: mujoco.MjSpec) -> None:
     """Let a spec keep the masses and inertias that are written into it, in place; it compiles to the same model.
 
-    A compiler that infers all of them from geoms (``inertiafromgeom="true"``, as in many of Gymnasium's models), or
-    scales them to a mass of all (``settotalmass``), overrides what is written.
+    A compiler that infers all of them from geoms (``inertiafromgeom="true"``, as in many of Gymnasium's models), scales
+    them to a mass of all (``settotalmass``), or keeps them from being small or impossible (``boundmass``,
+    ``boundinertia``, ``balanceinertia``), overrides what is written.
     """
     compiler, kinds = spec.compiler, mujoco.mjtInertiaFromGeom
-    inferred, scaled = compiler.inertiafromgeom == kinds.mjINERTIAFROMGEOM_TRUE, compiler.settotalmass > 0
-    if not (inferred or scaled):
+    inferred = compiler.inertiafromgeom == kinds.mjINERTIAFROMGEOM_TRUE
+    changed = max(compiler.settotalmass, compiler.boundmass, compiler.boundinertia, compiler.balanceinertia) > 0
+    if not (inferred or changed):
         return
     model = spec.compile()
     for body in spec.bodies:
-        if body.explicitinertial or (scaled and model.body_mass[body.id]):
+        if body.explicitinertial or (changed and model.body_mass[body.id]):
             _set_inertial(body, model)
-    compiler.settotalmass = -1
+    compiler.settotalmass, compiler.boundmass, compiler.boundinertia, compiler.balanceinertia = -1, 0, 0, False
     if inferred:
         compiler.inertiafromgeom = kinds.mjINERTIAFROMGEOM_AUTO
 

@@ -109,6 +109,20 @@ def add_passive_motor(spec: mujoco.MjSpec, name: str, joint: str, lugre: Sequenc
     return motor
 
 
+def keep_keyframes(spec: mujoco.MjSpec, before: mujoco.MjModel, joint: str) -> None:
+    """Let the keyframes of a spec have a joint that was added to its model at its reference, all else where it was.
+
+    MuJoCo puts what they lack at their ends, wherever the joint is.
+    """
+    after = spec.copy().compile()
+    at, of_speed = after.jnt_qposadr[after.joint(joint).id], dof(after, joint)
+    for key, qpos, qvel in zip(spec.keys, before.key_qpos, before.key_qvel, strict=True):
+        if len(key.qpos):
+            key.qpos = np.insert(qpos, at, after.qpos0[at])
+        if len(key.qvel):
+            key.qvel = np.insert(qvel, of_speed, 0.0)
+
+
 def inertia(spec: mujoco.MjSpec, joint: str) -> float:
     """Inertia along the joint in the model's reference pose [kg m2, kg]."""
     model = spec.copy().compile()
@@ -150,6 +164,7 @@ def add_link_joint(spec: mujoco.MjSpec, joint: str, name: str) -> Any:
         # Without effect on a slide, except that MuJoCo no longer takes the mass matrix of its body for diagonal, as it
         # does for slides along its axes.
         link.pos = at + 1.0
+    keep_keyframes(spec, model, name)
     return link
 
 

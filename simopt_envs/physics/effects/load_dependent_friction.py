@@ -9,7 +9,7 @@ import numpy as np
 
 from simopt_envs.physics.effects.actuators import BRAKE, actuators, driven_joint
 from simopt_envs.physics.effects.effect import Effect, Motion, object_name
-from simopt_envs.physics.effects.joints import add_fixed_tendon, blank, inertia, is_slide, scalar_joints
+from simopt_envs.physics.effects.joints import add_fixed_tendon, blank, inertia, is_slide, keep_keyframes, scalar_joints
 from simopt_envs.physics.parameters import Array, Parameter, Write
 
 _DRUM = 1.0  # m: its radius; the law does not depend on it
@@ -93,6 +93,7 @@ class LoadDependentFriction(Effect):
                 drive.trntype, drive.target = mujoco.mjtTrn.mjTRN_TENDON, tendon.name
                 if drive.inheritrange:
                     drive.inheritrange, drive.ctrlrange = 0, compiled.ctrlrange
+        keep_keyframes(spec, model, joint + BRAKE)
 
     def parameters(self, model: mujoco.MjModel, place: str) -> tuple[Parameter, ...]:
         """See :meth:`Effect.parameters`."""
