@@ -6,6 +6,7 @@ What a user got wrong is told in one line, with exit code 2, before any work sta
 
 from __future__ import annotations
 
+import os
 import shlex
 import sys
 from collections.abc import Sequence
@@ -28,12 +29,19 @@ _EXTRAS = {
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Run a command; ``argv`` is what follows the program's name, from the shell by default."""
+    """Run a command; ``argv`` is what follows the program's name, from the shell by default.
+
+    Ctrl-C there ends the process at once: threads may still simulate, and must not while Python takes itself down.
+    """
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:
         _run(arguments)
     except KeyboardInterrupt as interrupt:
         print(f"\n{_PROGRAM}: {interrupt.args[0] if interrupt.args else 'interrupted'}", file=sys.stderr)
+        if argv is None:
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(130)
         sys.exit(130)
     except (ValueError, TypeError, OSError, ImportError, RuntimeError, gym.error.Error) as error:
         if sys.flags.dev_mode:

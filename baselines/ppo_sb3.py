@@ -7,9 +7,11 @@ Like `baselines.ppo_torch.TorchPPO`, a trainer is a callable `(make_vector_env, 
 """
 
 import copy
-from collections.abc import Mapping
-from contextlib import closing
-from dataclasses import dataclass
+import random
+from collections.abc import Iterator, Mapping
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, cast
 
@@ -57,6 +59,7 @@ class SB3Policy:
         observation_statistics: Running mean and variance that observations are normalised by.
         return_statistics: Those of the discounted return, by which rewards are scaled.
         steps_trained: Control steps over all trainings.
+        variables: What the algorithm learns beside its networks, by name: SAC's entropy coefficient.
     """
 
     network: BasePolicy
@@ -64,6 +67,7 @@ class SB3Policy:
     observation_statistics: RunningMeanStd
     return_statistics: RunningMeanStd
     steps_trained: int
+    variables: dict[str, torch.Tensor] = field(default_factory=dict)
 
     def act(self, observations: NDArray[np.floating]) -> NDArray[np.float32]:
         """The mean action of each observation: (n, observation_size) -> (n, action_size), within the bounds."""
@@ -76,7 +80,7 @@ class SB3:
     """A trainer around any Stable-Baselines3 algorithm for continuous actions.
 
     Observations are normalised and rewards scaled by SB3's `VecNormalize`. SB3 draws from the global generators of
-    Python, NumPy and PyTorch; each call seeds them from its `rng`.
+    Python, NumPy and PyTorch; each call seeds them from its `rng`, and leaves them as they were.
 
     Args:
         algorithm: The class, such as `PPO` or `SAC`.
@@ -111,10 +115,11 @@ class SB3:
             policy: Where to start; None for new weights.
             rng: Seeds SB3's own generators.
         """
-        with closing(make_vector_env(self.num_envs)) as env, one_torch_thread():
+        with untouched_generators(), closing(make_vector_env(self.num_envs)) as env, one_torch_thread():
             model, worlds = self._model(env, seed=int(rng.integers(2**31)))
             if policy is not None:
                 model.set_parameters(copy.deepcopy(policy.parameters))  # Adam goes on in the very tensors it is given
+                _set_variables(model, policy.variables)
                 worlds.obs_rms = policy.observation_statistics.copy()  # type: ignore[assignment]
                 worlds.ret_rms = policy.return_statistics.copy()
             model.learn(self.total_timesteps if policy is None else self.warm_start_timesteps)
@@ -124,6 +129,7 @@ class SB3:
             observation_statistics=cast(RunningMeanStd, worlds.obs_rms),
             return_statistics=worlds.ret_rms,
             steps_trained=model.num_timesteps + (0 if policy is None else policy.steps_trained),
+            variables=_variables(model),
         )
 
     def identity(self) -> dict[str, Any]:
@@ -135,6 +141,7 @@ class SB3:
         content = {
             "spaces": [_describe(policy.network.observation_space), _describe(policy.network.action_space)],
             "parameters": policy.parameters,
+            "variables": policy.variables,
             "observation_statistics": _to_tensors(policy.observation_statistics),
             "return_statistics": _to_tensors(policy.return_statistics),
             "steps_trained": policy.steps_trained,
@@ -152,7 +159,8 @@ class SB3:
         spaces_only.num_envs = self.num_envs
         spaces_only.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
         spaces_only.single_observation_space, spaces_only.single_action_space = map(_box, content["spaces"])
-        model, _ = self._model(spaces_only, seed=0)
+        with untouched_generators():
+            model, _ = self._model(spaces_only, seed=0)
         model.set_parameters(content["parameters"])
         return SB3Policy(
             network=model.policy,
@@ -160,12 +168,38 @@ class SB3:
             observation_statistics=_from_tensors(content["observation_statistics"]),
             return_statistics=_from_tensors(content["return_statistics"]),
             steps_trained=content["steps_trained"],
+            variables=content.get("variables", {}),  # which older files lack
         )
 
     def _model(self, env: VectorEnv, seed: int) -> tuple[BaseAlgorithm, VecNormalize]:
         gamma = self.kwargs.get("gamma", 0.99)
         worlds = VecNormalize(VecMonitor(SB3VecEnv(env)), gamma=gamma, clip_obs=CLIP, epsilon=EPSILON)
         return self.algorithm(self.policy, worlds, seed=seed, **self.kwargs), worlds
+
+
+@contextmanager
+def untouched_generators() -> Iterator[None]:
+    """Put the global generators of Python, NumPy and PyTorch back as they were: SB3 seeds them all."""
+    python, numpy = random.getstate(), np.random.get_state()  # noqa: NPY002 - the very generator SB3 draws from
+    gpus = range(torch.cuda.device_count() if torch.cuda.is_initialized() else 0)
+    try:
+        with torch.random.fork_rng(gpus):
+            yield
+    finally:
+        random.setstate(python)
+        np.random.set_state(numpy)  # noqa: NPY002
+
+
+def _variables(model: BaseAlgorithm) -> dict[str, torch.Tensor]:
+    """Copies of the tensors that are learned and that `get_parameters` leaves out."""
+    tensors = {name: attrgetter(name)(model) for name in model._get_torch_save_params()[1]}
+    return {name: tensor.detach().clone() for name, tensor in tensors.items() if tensor.requires_grad}
+
+
+@torch.no_grad()
+def _set_variables(model: BaseAlgorithm, variables: Mapping[str, torch.Tensor]) -> None:
+    for name, tensor in variables.items():
+        attrgetter(name)(model).copy_(tensor)
 
 
 def _describe(space: gym.Space) -> dict[str, Any]:

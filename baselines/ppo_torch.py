@@ -44,6 +44,8 @@ except ImportError as error:
 MakeVectorEnv = Callable[[int], VectorEnv]
 Array = NDArray[np.float64]
 
+_WIDEST = 1e3  # bounds farther apart only stand for "none": they do not tell how far an observation moves
+
 
 @dataclass(frozen=True)
 class PPOConfig:
@@ -83,7 +85,8 @@ class PPOConfig:
     learning_rate_bounds: tuple[float, float] = (3e-4, 3e-3)
     """Least and greatest step size."""
     scale_floor: float = 0.01
-    """Observations are scaled by their standard deviation, or by this share of their range if that is more."""
+    """Observations are scaled by their standard deviation, or by this share of their range if that is more.
+    A range over 1000 wide is taken for none."""
     max_grad_norm: float = 1.0
     """Gradients are scaled down to this norm."""
     hidden: int = 64
@@ -195,6 +198,7 @@ class TorchPolicy(nn.Module):
     high: Tensor
     centre: Tensor
     half_range: Tensor
+    bounded: Tensor
 
     def __init__(
         self,
@@ -222,6 +226,7 @@ class TorchPolicy(nn.Module):
             ("high", high),
             ("centre", torch.where(bounded, (low + high) / 2, 0.0)),
             ("half_range", torch.where(bounded, (high - low) / 2, 1.0)),
+            ("bounded", bounded),
         ):
             self.register_buffer(name, values, persistent=False)
 
@@ -456,7 +461,7 @@ def update(
             clipped = ratio.clamp(1 - config.clip, 1 + config.clip)
             gain = torch.minimum(ratio * part.advantages, clipped * part.advantages).mean()
             value_error = (policy.critic(part.observations).squeeze(-1) - part.value_targets).square().mean()
-            excess = (means.abs() - 1).clamp(min=0).square().sum(-1).mean()
+            excess = (policy.bounded * (means.abs() - 1).clamp(min=0)).square().sum(-1).mean()
             loss = (
                 0.5 * value_error - gain - config.entropy_weight * policy.log_std.sum() + config.bound_weight * excess
             )
@@ -625,7 +630,8 @@ def _starting_policy(
         fresh = TorchPolicy(observation_size, low, high, config.hidden, config.initial_log_std, generator)
         observed = env.single_observation_space
         width = torch.from_numpy(observed.high - observed.low).double()  # type: ignore[attr-defined]
-        fresh.observation_normaliser.floor[width.isfinite()] = config.scale_floor * width[width.isfinite()]
+        telling = width <= _WIDEST
+        fresh.observation_normaliser.floor[telling] = config.scale_floor * width[telling]
         return fresh
     given = (policy.observation_size, policy.low.tolist(), policy.high.tolist())
     if given != (observation_size, low, high):

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from conftest import needs_effects, needs_examples
 
-from simopt_envs.measured import Finding, Recording, audit, audited, inspect_log, load_recording
+from simopt_envs.measured import Finding, Recording, audit, audited, inspect_log, load_recording, plots
 from simopt_envs.physics.effects import EFFECTS
 
 EXAMPLES = Path(__file__).parents[1] / "simopt_envs" / "measured" / "examples"
@@ -180,7 +180,7 @@ DEFECTS: dict[str, tuple[Callable[[], Recording], str, str, str]] = {
         lambda: with_time(GOOD.time + np.random.default_rng(0).uniform(0, 0.001, 3000)),
         "warning", "jitter", "% of the intervals differ by more than 10 % from the median",
     ),
-    "time in ms": (lambda: with_time(GOOD.time * 1e3), "warning", "units", "the rate is 0.5.* Hz: is time in seconds"),
+    "time in ms": (lambda: with_time(GOOD.time * 1e3), "error", "units", "the rate is 0.5.* Hz: is time in seconds"),
     "wrong rate": (lambda: with_time(GOOD.time * 2), "warning", "velocity", "rate of the time stamps"),
     "nan": (lambda: with_columns(qpos__elbow=holed("qpos/elbow", np.s_[50:80])), "warning", "missing", "1 % of"),
     "mostly nan": (
@@ -397,8 +397,16 @@ def test_inspecting_never_raises_for_a_bad_log(tmp_path):
         inspect_log(tmp_path / "empty.csv", tmp_path / "nowhere.xml")
 
 
-def test_inspecting_writes_a_table_and_a_plot(tmp_path):
+def test_inspecting_writes_a_table_and_a_plot(tmp_path, monkeypatch):
     pytest.importorskip("matplotlib")
+    labels: list[str] = []
+    save = plots._save
+
+    def labelled(figure, path):
+        labels.extend(axis.get_ylabel() for axis in figure.axes)
+        return save(figure, path)
+
+    monkeypatch.setattr(plots, "_save", labelled)
     (tmp_path / "arm.xml").write_text(ARM)
     log = DEFECTS["gap"][0]().save(tmp_path / "run.csv")
     inspection = inspect_log(log, tmp_path / "arm.xml", out=tmp_path / "out")
@@ -406,6 +414,9 @@ def test_inspecting_writes_a_table_and_a_plot(tmp_path):
     assert "run: 2900 samples" in str(inspection)
     assert "warning: time: 1 gaps" in (tmp_path / "out" / "findings.txt").read_text()
     assert (tmp_path / "out" / "run.png").stat().st_size > 10_000
+    assert {"ctrl/elbow", "qvel/elbow\n[rad/s]", "qpos/rail\n[m]", "interval [ms]"} <= {
+        label.removesuffix("\n[1]") for label in labels
+    }
 
 
 @needs_examples

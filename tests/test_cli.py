@@ -145,6 +145,66 @@ def test_adapt_a_model_to_recordings(workplace, capsys):
     assert (workplace / "out" / "report.html").exists()
     said = " ".join(capsys.readouterr().out.split())
     assert "simopt-envs gap arm.xml --data log.csv --out out/gap" in said
+    assert json.loads((workplace / "out" / "details.json").read_text())["channel_units"] == {"qpos/hinge": "rad"}
+
+
+def test_what_to_type_next_is_quoted(workplace, capsys, without_report):
+    (workplace / "log.csv").rename("my log.csv")
+    files = ("--data", "my log.csv", "--parameters", "xi.yaml", "--out", "my out")
+    main(["adapt", "arm.xml", *files, "--iterations", "0", "--rollouts", "9", "--real-rollouts", "3"])
+    assert "simopt-envs gap arm.xml --data 'my log.csv' --out 'my out/gap'" in capsys.readouterr().out
+
+
+def test_a_film_of_other_policies_is_not_left(workplace, without_report):
+    adapt("--iterations", "0")
+    (workplace / "out" / "film.png").write_bytes(b"")
+    adapt("--iterations", "0", "--resume")
+    assert (workplace / "out" / "film.png").exists()
+    adapt("--resume")  # the toy cannot be filmed
+    assert not (workplace / "out" / "film.png").exists()
+
+
+def test_gap_prints_what_it_saved_as_it_is(workplace, capsys, monkeypatch):
+    class Found:
+        def save(self, folder):
+            (folder / ".fits").mkdir(parents=True, exist_ok=True)
+            (folder / "saved").touch()
+            return folder
+
+        def __str__(self):
+            assert (workplace / "out" / "saved").exists()
+            return f"named [bold]{'long ' * 40}"
+
+    monkeypatch.setattr("simopt_envs.gap.find_gap", lambda *_, **__: Found())
+    main(["gap", "arm.xml", "--data", "log.csv", "--out", "out"])
+    assert capsys.readouterr().out == f"named [bold]{'long ' * 40}\nreport: out/report.html\n"
+    assert not (workplace / "out" / ".fits").exists()
+
+
+def test_a_gap_that_is_interrupted_goes_on_with_the_same_command(workplace, capsys, monkeypatch):
+    def find_gap(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("simopt_envs.gap.find_gap", find_gap)
+    with pytest.raises(SystemExit):
+        main(["gap", "arm.xml", "--data", "log.csv", "--out", "my out"])
+    typed = "simopt-envs gap arm.xml --data log.csv --out 'my out'"
+    assert capsys.readouterr().err.endswith(f"interrupted; go on with: {typed}\n")
+
+
+def test_ctrl_c_ends_the_program_before_threads_can_outlive_python(capsys, monkeypatch):
+    def interrupted(arguments):
+        raise KeyboardInterrupt
+
+    ended: list[int] = []
+    monkeypatch.setattr("baselines.cli._run", interrupted)
+    monkeypatch.setattr(os, "_exit", ended.append)
+    for argv, left in (([], []), (None, [130])):
+        with pytest.raises(SystemExit) as end:
+            main(argv)
+        assert end.value.code == 130
+        assert ended == left
+        assert capsys.readouterr().err == "\nsimopt-envs: interrupted\n"
 
 
 def test_inspect_and_replay(workplace, capsys):
@@ -212,6 +272,7 @@ def test_target_files_with_mistakes(workplace, capsys, target, message):
         ((*VARY, "--epsilon", "0"), "epsilon must be positive and finite"),
         ((*VARY, "--target", "nowhere.json"), "there is no target file nowhere.json"),
         ((*VARY, "--data", "log.csv"), "--data belongs to the model form of adapt"),
+        ((*VARY, "--keyframe", "home"), "--keyframe belongs to the model form of adapt"),
     ],
 )
 def test_options_with_mistakes(workplace, capsys, options, message):
@@ -236,6 +297,15 @@ def test_options_with_mistakes(workplace, capsys, options, message):
             ("adapt", "arm.xml", "--data", "log.csv", "--parameters", "xi.yaml", "--window", "60"),
             "no whole window of 60 s",
         ),
+        (
+            ("adapt", "arm.xml", "--data", "log.csv", "--parameters", "xi.yaml", "--window", "0"),
+            "windows of 0 s hold no two samples that are 0.005 s apart",
+        ),
+        (
+            ("adapt", "arm.xml", "--data", "log.csv", "--parameters", "xi.yaml", "--keyframe", "nope"),
+            "unknown keyframe 'nope': the model has none",
+        ),
+        (("replay", "arm.xml", "--data", "log.csv", "--mapping", "nowhere.yaml"), "there is no file nowhere.yaml"),
         (("replay", "arm.xml", "--data", "nowhere.csv"), "there is no file nowhere.csv"),
     ],
 )

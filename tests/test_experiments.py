@@ -353,15 +353,16 @@ class Line:
         raise NotImplementedError
 
     def rollout(self, policy, space, xi, real, seed):
-        n, steps = len(xi), len(real[0])
+        n, r, steps = len(xi), len(real), len(real[0])
         self.simulated += n
-        offset = np.broadcast_to(xi[:, :1, None], (n, steps + 1, 1))
-        actions = np.stack([policy.act(np.zeros((n, 2))) for _ in range(steps)], axis=1)
-        observations = np.concatenate([0 * offset, offset], axis=2) + np.concatenate(
-            [np.zeros((n, 1, 2)), np.cumsum(actions, axis=1) * [1.0, 0.0]], axis=1
-        )
-        once = np.full((n, 1), steps), np.zeros((n, 1), bool), None
-        return Rollouts(observations[:, None], actions[:, None], *once)
+        if policy is None:
+            actions = np.tile([trajectory.actions for trajectory in real], (n, 1, 1, 1))
+        else:
+            actions = np.stack([policy.act(np.zeros((n * r, 2))) for _ in range(steps)], axis=1).reshape(n, r, steps, 1)
+        observations = np.zeros((n, r, steps + 1, 2))
+        observations[:, :, 1:, 0] = np.cumsum(actions[..., 0], axis=2)
+        observations[..., 1] = xi[:, :1, None]
+        return Rollouts(observations, actions, np.full((n, r), steps), np.zeros((n, r), bool), None)
 
 
 class Still:

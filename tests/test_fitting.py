@@ -4,6 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from baselines.commands.recordings import HeldOut
 from simopt_envs.adaptation import RecordedSystem, ReplaySimulator, SimOpt, window_trajectories
 from simopt_envs.adaptation.fitting import CMAES, LeastSquares, Noise, WindowMisfit, untold_combinations
 from simopt_envs.distributions import Gaussian
@@ -118,6 +119,12 @@ def test_what_the_data_say_nothing_about_is_said():
     posterior = Gaussian(space, prior.mean, np.diag([1e-4, 0.24]))
     assert untold_combinations(prior, posterior) == ["The data say hardly anything about damping."]
     assert len(untold_combinations(prior, prior)) == 2
+
+
+def test_a_fit_that_ends_at_a_bound_is_tried_on_what_was_held_out(model, windows):
+    rounded = Gaussian(SPACE, SPACE.to_unconstrained(SPACE.high) + 1e-15, PRIOR.covariance)
+    assert rounded.median[0] > SPACE.high[0]
+    assert HeldOut.of(model, windows, PRIOR, rounded).after[0] > 0
 
 
 def test_whitening_leaves_independent_errors():

@@ -11,8 +11,10 @@ import pytest
 from conftest import needs_effects
 from gap_plant import MODEL, record
 
+from simopt_envs.distributions import Gaussian
 from simopt_envs.gap import find, find_gap
 from simopt_envs.measured import Recording, cut_windows, simulate_windows
+from simopt_envs.physics import Parameter, ParameterSpace, Write
 from simopt_envs.physics.effects import EFFECTS
 
 pytestmark = needs_effects
@@ -143,6 +145,11 @@ def test_what_cannot_be_searched_is_said_before_any_work():
         find_gap(spec(), [])
     with pytest.raises(FileNotFoundError, match=r"nothing\.xml"):
         find_gap("nothing.xml", recordings)
+    xi = ParameterSpace([Parameter("m", "1", 1.0, 0.1, 9.0, "log", (Write("body_mass", "lower", operation="scale"),))])
+    with pytest.raises(ValueError, match=r"as p\(ξ\) or by xi.yaml, not both"):
+        find_gap(spec(), recordings, plain=Gaussian.around_nominal(xi, 0.1), config="xi.yaml")
+    with pytest.raises(FileNotFoundError, match=r"no parameter file xi\.yaml"):
+        find_gap(spec(), recordings, config="xi.yaml")
     other = replace(recordings[1], columns={n: v for n, v in recordings[1].columns.items() if n != "qpos/elbow"})
     with pytest.raises(ValueError, match="different columns"):
         find_gap(spec(), [recordings[0], other])

@@ -5,8 +5,14 @@ import mujoco
 import numpy as np
 import pytest
 from conftest import needs_effects
+from gap_plant import MODEL
 
-from simopt_envs.gap.repair import to_xml_in
+from simopt_envs.gap.hypothesis import Candidate, Hypothesis
+from simopt_envs.gap.plain import plain_parameters
+from simopt_envs.gap.repair import difference, observation_model, to_xml_in
+from simopt_envs.measured import Recording, load_recording
+from simopt_envs.physics.columns import ColumnModel
+from simopt_envs.physics.effects import EFFECTS, Motion
 
 pytestmark = needs_effects
 
@@ -39,6 +45,33 @@ def test_a_repaired_model_finds_its_meshes_and_textures_from_where_it_is_saved(t
     assert (spec.compiler.meshdir, spec.compiler.texturedir) == ("meshes", "pictures")
 
 
+@pytest.mark.parametrize("share", [0.0, 0.4])
+def test_recordings_are_read_as_the_repaired_model_means_them(tmp_path, share):
+    """What MJCF cannot hold, two things of one sensor, stands in the diff and in a mapping."""
+    pytest.importorskip("yaml")
+    plain, time = plain_parameters(mujoco.MjSpec.from_string(MODEL)), 0.01 * np.arange(200)
+    motion = Motion(*np.ones((5, 2)))
+    of_sensor = [Candidate(EFFECTS[name], "joint:elbow") for name in ("sensor_scale", "sensor_delay")]
+    hypothesis = Hypothesis(plain, of_sensor, motion)
+    names = hypothesis.space.names
+    sizes = {"scale": 1.05, "lag_share": share, "delay": 0.02}
+    chosen = {next(n for n in names if n.startswith("sensor_") and n.endswith(key)): v for key, v in sizes.items()}
+    xi = hypothesis.space.values(chosen)
+    true = {"ctrl/elbow": np.cos(3 * time), "qpos/shoulder": np.cos(time), "qpos/elbow": np.sin(3 * time)}
+    shown = ColumnModel(hypothesis.space, ["qpos/elbow"]).shown(true["qpos/elbow"][None, None, :, None], xi[None], 0.01)
+    Recording(time, {**true, "qpos/elbow": shown[0, 0, :, 0]}).save(tmp_path / "log.csv")
+    columns = observation_model(hypothesis, xi, true)
+    (tmp_path / "columns.yaml").write_text(columns)
+    read = load_recording(tmp_path / "log.csv", tmp_path / "columns.yaml")
+    assert [*read.columns] == [*true]
+    assert np.isnan(read["qpos/elbow"]).sum() == 2, "what it shows only later is not known"
+    tolerance = 0.5 * (3 * 0.02) ** 2 * share + 1e-5  # a lag is undone as if it were dead time
+    for name, values in true.items():
+        np.testing.assert_allclose(read[name][20:-2], values[20:-2], rtol=0, atol=tolerance)
+    diff = difference(hypothesis.spec, hypothesis.spec, columns)
+    assert [line for line in diff.splitlines() if line.startswith("+  ")] == [f"+{columns.splitlines()[1]}"]
+
+
 def test_a_repaired_model_finds_the_sides_of_a_sky(tmp_path):
     matplotlib.image.imsave(tmp_path / "side.png", np.zeros((4, 4, 3)))
     sides = " ".join(f'file{side}="side.png"' for side in ("right", "left", "up", "down", "front", "back"))
@@ -53,3 +86,8 @@ def test_a_repaired_model_without_files_tells_of_no_folder(tmp_path):
     spec = mujoco.MjSpec.from_string("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
     spec.compile()
     assert to_xml_in(spec, tmp_path) == spec.to_xml()
+    plain = plain_parameters(mujoco.MjSpec.from_string(MODEL))
+    assert (
+        observation_model(Hypothesis(plain, (), Motion(*np.ones((5, 2)))), plain.prior.space.nominal, ["qpos/elbow"])
+        == ""
+    )

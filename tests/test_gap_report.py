@@ -1,5 +1,7 @@
 """The figures of a gap report, and the page."""
 
+from types import SimpleNamespace
+
 import mujoco
 import numpy as np
 import pytest
@@ -8,10 +10,11 @@ from gap_plant import MODEL
 
 from simopt_envs.gap.confusion import Partner, Separation
 from simopt_envs.gap.curves import Curve
+from simopt_envs.gap.error import moving_channels
 from simopt_envs.gap.figures import candidates_figure, curve_figure, error_figure, overlay_figure, regime_figure
 from simopt_envs.gap.hypothesis import Candidate
 from simopt_envs.gap.localise import Partition, Row, tabulate
-from simopt_envs.gap.report import diff, effects, table, warnings
+from simopt_envs.gap.report import diff, effects, table, verdict, warnings
 from simopt_envs.gap.result import Estimate, Named, two_directions
 from simopt_envs.measured.channels import Channel
 from simopt_envs.measured.recording import Recording
@@ -60,19 +63,48 @@ def test_overlays_show_channels_that_move(windows):
     assert all(np.allclose(line.get_ydata(), 0.0) for line in errors)
 
 
-def test_regimes_are_blank_within_the_noise():
+@pytest.mark.parametrize("name", ["time in it", "speed of arm: elbow $x_1$"])
+def test_regimes_are_blank_within_the_noise(name, tmp_path):
     late = np.zeros((24, SAMPLES), dtype=bool)
     late[:, SAMPLES // 2 :] = True
     errors = RNG.standard_normal((24, SAMPLES, 2))
     errors[..., 0] += 4.0 * late
-    parts = [Partition("all", {"": np.ones_like(late)}), Partition("time in it", {"early": ~late, "late": late})]
+    parts = [Partition("all", {"": np.ones_like(late)}), Partition(name, {"early": ~late, "late": late})]
     rows = tabulate(["qpos/elbow", "qpos/wrist"], errors, np.ones(errors.shape, dtype=bool), parts)
-    bars, cells = regime_figure(rows).axes[:2]
+    figure = regime_figure(rows)
+    bars, cells = figure.axes[:2]
+    assert save_figure(figure, tmp_path / "regimes.png").exists()
+    assert [text.get_parse_math() for text in cells.texts if name.split()[-1] in text.get_text()] == ["$" not in name]
     assert [label.get_text() for label in bars.get_yticklabels()] == ["qpos/elbow", "qpos/wrist"]
     assert [label.get_text() for label in cells.get_xticklabels()] == ["early", "late"]
     shown = cells.images[0].get_array()
     assert np.isfinite(shown.filled(np.nan)[0, 1])
     assert np.isnan(shown.filled(np.nan)[:, 0]).all()
+
+
+@pytest.mark.parametrize(
+    ("refit", "after", "said"),
+    [
+        (0.5, 0.2, "That explains 75% of the error that noise does not; the rest"),
+        (0.5, 0.1, "With it, the mean square of the errors is 2.4 times that of noise; the rest"),
+    ],
+)
+def test_a_part_that_is_named_never_explains_all(refit, after, said):
+    gap = SimpleNamespace(
+        verdict="partly",
+        errors=SimpleNamespace(before=1.0, refit=refit, after=after, noise_floor=0.1),
+        effects=["coulomb_friction at joint:elbow"],
+        explanation=SimpleNamespace(final=SimpleNamespace(excess=1.4)),
+        remarks=(),
+    )
+    assert said in verdict(gap, None).content["sentence"]
+
+
+def test_what_moves_is_told_from_noise():
+    scale, noise = np.array([1.0, 1e-3]), np.full(2, 1e-3)
+    assert moving_channels(("qpos/a", "qpos/b"), scale, noise).tolist() == [True, False]
+    with pytest.raises(ValueError, match="nothing moves in the recordings held out: qpos/b show noise alone"):
+        moving_channels(("qpos/b",), scale[1:], noise[1:])
 
 
 def test_regimes_of_a_model_without_any():

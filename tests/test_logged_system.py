@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 import toy_reach  # noqa: F401 - registers an environment that is none of this package
-from conftest import needs_batch
+from conftest import needs_batch, needs_effects
 
-from baselines.commands.gap import environment
 from baselines.logged_system import LoggedSystem
 from simopt_envs.adaptation import HiddenSystem
+from simopt_envs.gap import find
+from simopt_envs.gap.environments import environment
 from simopt_envs.measured import load_recording
 from simopt_envs.tasks.effects import with_effects
 
@@ -69,6 +70,16 @@ def test_an_environments_model_and_the_plain_parameters_that_its_logs_tell_of(en
     assert spec.compile().nu >= 7
     assert kept in plain.space
     assert not [name for name in plain.space.names if name.startswith("action_scaling")]
+
+
+@needs_batch
+@needs_effects
+def test_a_gap_search_takes_an_environment_by_its_id(tmp_path):
+    robot = LoggedSystem(DRAWER, tmp_path)
+    logs = [robot.log(rolled) for rolled in robot.rollout(Reach(), 2, np.random.default_rng(1))]
+    found, (_, plain) = find.read(DRAWER, logs), environment(DRAWER)
+    assert {*plain.space.names} <= {*found.plain.prior.space.names}
+    assert found.keyframe == "home"
 
 
 def test_an_environment_without_a_task_is_told():

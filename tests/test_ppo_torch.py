@@ -167,6 +167,28 @@ class Precise(Aim):
         return super().step(action)
 
 
+@pytest.mark.parametrize(("bound", "penalised"), [(2.0, True), (np.inf, False)])
+def test_mean_actions_beyond_their_bounds_are_penalised_where_there_are_bounds(bound, penalised):
+    class Bounded(Aim):
+        action_space = gym.spaces.Box(-bound, bound, (1,), np.float32)
+
+    start = train(replace(SMALL, iterations=0), env_class=Bounded)
+    torch.nn.init.constant_(start.actor[-1].bias, 3.0)
+    with_penalty, without = (
+        train(replace(SMALL, warm_start_iterations=1, bound_weight=weight), policy=start, env_class=Bounded)
+        for weight in (5.0, 0.0)
+    )
+    assert torch.equal(weights(with_penalty), weights(without)) != penalised
+
+
+@pytest.mark.parametrize(("bound", "floor"), [(5.0, 0.1), (1e6, 1e-4), (np.inf, 1e-4)])
+def test_bounds_that_tell_nothing_set_no_scale(bound, floor):
+    class Bounded(Aim):
+        observation_space = gym.spaces.Box(-bound, bound, (1,), np.float64)
+
+    assert train(replace(SMALL, iterations=0), env_class=Bounded).observation_normaliser.floor == floor
+
+
 def test_bounds_in_double_precision_are_kept_and_fit_again(tmp_path):
     config = replace(SMALL, iterations=1, initial_log_std=1.0)
     policy, trainer = train(config, env_class=Precise), TorchPPO(config)

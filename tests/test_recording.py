@@ -225,7 +225,12 @@ def test_text_without_names_or_stamps(tmp_path):
         ("columns: {qpos/a: x}\nsamplerate: 3", "unknown key 'samplerate'; did you mean 'sample_rate'"),
         ("columns: {qpos/a: x}\nsample_rate: -3", "must be positive, got -3 Hz"),
         ("columns: {}", "at least one column"),
-        ("rows: []", "has a key 'columns'"),
+        ("rows: []", "has a key 'columns', or 'shown'"),
+        ("columns: 3", "'columns' has recording columns as keys, got 3"),
+        ("shown: {angle: {sacle: 2}}", "unknown key of column 'angle': 'sacle'; did you mean 'scale'"),
+        ("shown: {angle: {scale: 0}}", "whose scale is 0 shows nothing"),
+        ("shown: {angle: }", "expected some of scale, bias, delay, lag_share, got None"),
+        ("shown: {angel: {bias: 1}}", "unknown column that is shown 'angel'; did you mean 'angle'"),
         ("columns: [", "is not YAML"),
         ("columns: {qpos/a: angel}", "unknown column of the log 'angel'; did you mean 'angle'"),
     ],
@@ -323,6 +328,11 @@ def test_parquet_of_whole_nanoseconds_and_long_lists(tmp_path):
     recording = load_recording(tmp_path / "a.parquet", LogMapping({"qpos/a": Source("q/1")}, Source("t", unit="ns")))
     assert np.diff(recording.time) == pytest.approx(0.01, abs=1e-6)
     np.testing.assert_array_equal(recording["qpos/a"], [2, 4])
+    parquet.write_table(
+        pa.table({"time": stamps.cast(pa.timestamp("ns")), "qpos/a": [1.0, 2.0]}), tmp_path / "b.parquet"
+    )
+    with pytest.raises(ValueError, match=r"column 'time' holds no numbers \(timestamp\[ns\] ...\)"):
+        load_recording(tmp_path / "b.parquet")
 
 
 # --- damaged files --------------------------------------------------------------------------------------------------
@@ -333,10 +343,12 @@ def test_parquet_of_whole_nanoseconds_and_long_lists(tmp_path):
     [
         ("a.csv", b"", "the file is empty"),
         ("a.csv", b"\n\n", "holds no line of data"),
-        ("a.csv", b"time,qpos/a\n", "no row has the 2 values"),
+        ("a.csv", b"time,qpos/a\n", "holds no row of data"),
+        ("a.csv", b"time,qpos/a\n0\n", "no row has the 2 values"),
+        ("a.csv", b"time,qpos/a\n2024-01-01 12:00,1\n", r"column 'time' holds no numbers \('2024-01-01 12:00' ...\)"),
         ("a.csv", b"time,qpos/a,qpos/a\n0,1,2\n", "'qpos/a' appears more than once"),
         ("a.csv", b"t,qpos/a\n0,1\n", "no column 'time' among t, qpos/a"),
-        ("a.csv", b"\xff\xfe\x00\x81", "is not text"),
+        ("a.csv", b"\xff\xfe\x00\x81", "is not UTF-8 text"),
         ("a.npz", b"PK no archive", "cannot be read"),
         ("a.mat", b"no matlab", "cannot be read"),
     ],
@@ -357,8 +369,44 @@ def test_parquet_without_or_with_its_package(tmp_path):
 
 def test_no_file_can_run_code(tmp_path):
     np.savez(tmp_path / "a.npz", time=np.array([{"code": 1}], dtype=object))
-    with pytest.raises(ValueError, match="cannot be read"):
+    with pytest.raises(ValueError, match=r"a\.npz cannot be read: .* array 'time' cannot be read"):
         load_recording(tmp_path / "a.npz")
+
+
+def test_dates_are_no_time_and_a_column_of_stamps_is(tmp_path):
+    time, path = np.arange(3.0), tmp_path / "a.npz"
+    np.savez(path, time=time[:, None], **{"qpos/a": time})
+    np.testing.assert_array_equal(load_recording(path).time, time)
+    np.savez(path, time=np.datetime64("2024-01-01") + time.astype("timedelta64[s]"))
+    with pytest.raises(ValueError, match=r"a: column 'time' holds no numbers \('2024-01-01T00:00:00' ...\)"):
+        load_recording(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("decimal commas.csv", "time;qpos/a;note\n0,01;-1,5;a, b\n0,02;2;\n"),
+        ("decimal commas, tabs.csv", "time\tqpos/a\n0,01\t-1,5e0\n0,02\t2\n"),
+        ("blanks before quotes.csv", '"time", "qpos/a"\n0.01, -1.5\n0.02, 2\n'),
+        ("LOUD.CSV", "time,qpos/a\n0.01,-1.5\n0.02,2\n"),
+        ("commas at the ends.csv", "time,qpos/a,,\n0.01,-1.5,,\n0.02,2,,\n"),
+        ("commas in a name.csv", "time;qpos/a;note (a, b)\n0.01;-1.5;x\n0.02;2;\n"),
+    ],
+)
+def test_text_as_others_write_it(tmp_path, name, content):
+    (tmp_path / name).write_text(content)
+    recording = load_recording(tmp_path / name)
+    np.testing.assert_array_equal(recording.time, [0.01, 0.02])
+    assert list(recording.columns) == ["qpos/a"]
+    np.testing.assert_array_equal(recording["qpos/a"], [-1.5, 2])
+
+
+def test_decimal_commas_are_told_from_thousands_and_from_columns(tmp_path):
+    (tmp_path / "a.csv").write_text("time\tqpos/a\n0\t999.5\n1\t1,000.5\n")
+    assert np.isnan(load_recording(tmp_path / "a.csv")["qpos/a"][1]), "no number is better than a wrong one"
+    (tmp_path / "b.csv").write_text("0,01;1,5\n0,02;2\n")
+    mapping = LogMapping({"qpos/a": Source("a")}, column_names=("time", "a"))
+    np.testing.assert_array_equal(load_recording(tmp_path / "b.csv", mapping)["qpos/a"], [1.5, 2])
 
 
 def test_rows_that_broke_and_cells_that_are_no_numbers_are_named(tmp_path):

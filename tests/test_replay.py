@@ -260,6 +260,11 @@ def test_what_cannot_be_replayed_is_refused():
         cut_windows(model, recording.only(["ctrl/push", "ctrl/servo"]))
     with pytest.raises(ValueError, match=r"no whole window of 5 s .* the longest lasts 0\.598 s"):
         cut_windows(model, recording, 5.0)
+    for seconds in (0.0, -1.0, 0.0005):
+        with pytest.raises(ValueError, match=rf"windows of {seconds:g} s hold no two samples that are 0\.002 s apart"):
+            cut_windows(model, recording, seconds)
+    with pytest.raises(ValueError, match="unknown keyframe 'home': the model has none"):
+        cut_windows(model, recording, keyframe="home")
     broken = recording["ctrl/push"].copy()
     broken[5] = np.nan
     with pytest.raises(ValueError, match="command ctrl/push has values that are not finite"):

@@ -8,9 +8,10 @@ import pytest
 
 from simopt_envs.adaptation import RecordedSystem, ReplaySimulator, SimOpt, window_trajectories
 from simopt_envs.distributions import Gaussian
+from simopt_envs.engine import ThreadEngine
 from simopt_envs.measured.recording import Recording
 from simopt_envs.measured.trajectory import Trajectory
-from simopt_envs.measured.windows import cut_windows
+from simopt_envs.measured.windows import WindowSimulator, cut_windows
 from simopt_envs.physics import ModelWriter, Parameter, ParameterSpace, Write
 
 XML = """
@@ -96,6 +97,26 @@ def test_at_the_true_parameters_the_windows_are_met(model, windows):
     true, nominal = np.sqrt(np.square(difference).mean(axis=(1, 2, 3)))
     assert true < 0.03
     assert nominal > 0.1
+
+
+def test_threads_get_the_same_replays(model, windows):
+    real, xi = window_trajectories(windows), Gaussian.around_nominal(SPACE, 0.3).sample(300, np.random.default_rng(0))
+    local, threads = (
+        ReplaySimulator(model, SPACE, windows, engine).rollout(None, SPACE, xi, real, 0)
+        for engine in (None, ThreadEngine())
+    )
+    np.testing.assert_array_equal(threads.observations, local.observations)
+
+
+def test_windows_that_look_alike_keep_their_commands(model):
+    """A joint that sticks shows the same whatever the drive tries."""
+    torque = np.repeat([0.0, 0.01, 0.04], 50)
+    still = Recording(0.005 * np.arange(150), {"ctrl/drive": torque, "qpos/hinge": np.zeros(150)})
+    windows = cut_windows(model, still, seconds=0.2)
+    real, xi = window_trajectories(windows), np.array([[0.001, 0.02]])
+    replayed = ReplaySimulator(model, SPACE, windows).rollout(None, SPACE, xi, real, 0).observations[0]
+    np.testing.assert_array_equal(replayed, WindowSimulator(model, windows, SPACE)(xi)[0])
+    assert len(np.unique(replayed[:, -1])) == len(real) == 3
 
 
 def test_what_cannot_be_replayed(model, windows):

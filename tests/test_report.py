@@ -15,7 +15,7 @@ from toy_reach import SPACE, LeanTrainer, ReachEnv
 from simopt_envs.adaptation import HiddenSystem, SimOpt
 from simopt_envs.distributions import Gaussian
 from simopt_envs.report import Details, Run, write_report
-from simopt_envs.report.figures import parameters_figure
+from simopt_envs.report.figures import overlay_figure, parameters_figure
 from simopt_envs.report.film import film_policies, record_clip, strip_figure
 from simopt_envs.report.sections import directions
 
@@ -89,6 +89,16 @@ def test_the_truth_is_shown_only_where_it_is_known(run):
     Details(truth={}).save(run)  # known to be nominal
     assert "hidden truth" in legend()
     np.testing.assert_array_equal(Run.load(run).truth, SPACE.nominal)
+
+
+def test_channels_have_the_units_that_are_known_and_dollars_as_they_are(run):
+    result = json.loads((run / "result.json").read_text())
+    names = result["observation_names"]
+    (run / "result.json").write_text(json.dumps(result | {"observation_names": ["$a_1$", *names[1:]]}))
+    Details(channel_units={"$a_1$": "rad"}).save(run)
+    axes = overlay_figure(Run.load(run)).axes
+    labels = {axis.yaxis.label.get_text(): axis.yaxis.label.get_parse_math() for axis in axes if axis.get_ylabel()}
+    assert labels == {"$a_1$\n[rad]": False} | dict.fromkeys(names[1:], True)
 
 
 def test_the_page_stands_alone(run):
@@ -210,6 +220,16 @@ def test_films(tmp_path, monkeypatch, has_ffmpeg):
     half = frames.shape[2] // 2
     before, after = frames[-1, -8:, :half].mean(), frames[-1, -8:, half + 4 :].mean()
     assert after > 1.5 * before
+
+
+def test_a_film_that_is_cut_short_leaves_no_strip(tmp_path, monkeypatch):
+    def killed(clips, path):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("simopt_envs.report.film.write_film", killed)
+    with pytest.raises(KeyboardInterrupt):
+        film_policies("Toy/Painted-v0", {"before": Constant(0.2)}, {}, tmp_path)
+    assert not (tmp_path / "film.png").exists()
 
 
 def test_the_strip_has_a_row_of_frames_for_each_policy():

@@ -120,6 +120,25 @@ def test_another_run_in_the_folder_is_left_alone(tmp_path):
     assert {path: path.read_bytes() for path in directory.rglob("*") if path.is_file()} == before
 
 
+def test_a_file_that_is_none_of_the_runs_is_left_alone(tmp_path, undisturbed):
+    directory = tmp_path / "run"
+    run(directory, iterations=1)
+    (directory / "checkpoints/.DS_Store").write_text("a file manager's")
+    assert_same(directory, run(directory, resume=True), undisturbed)
+    assert (directory / "checkpoints/.DS_Store").exists()
+
+
+def test_no_finished_iteration_is_lost(tmp_path):
+    directory = tmp_path / "run"
+    run(directory, iterations=2)
+    before = (directory / "result.json").read_text()
+    with pytest.raises(ValueError, match="holds a run of 2 iterations; resume it with as many or more, not with 1"):
+        run(directory, resume=True, iterations=1)
+    loop = make(TARGET, directory=directory, updates_per_iteration=2, simulated_rollouts=60)
+    next(loop.run(2, resume=True))  # and is stopped
+    assert (directory / "result.json").read_text() == before
+
+
 def test_a_result_without_its_checkpoints_is_not_overwritten(tmp_path):
     (tmp_path / "result.json").write_text("{}")
     for resume in (False, True):

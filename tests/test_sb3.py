@@ -1,5 +1,6 @@
 import copy
 import json
+import random
 from functools import partial
 
 import gymnasium as gym
@@ -308,6 +309,31 @@ def test_other_algorithms(tmp_path):
     actions = trainer.load(tmp_path / "sac.pt").act(np.linspace(-5, 5, 20).reshape(-1, 1))
     assert np.all(np.abs(actions) <= 2.0)
     np.testing.assert_array_equal(actions, policy.act(np.linspace(-5, 5, 20).reshape(-1, 1)))
+
+
+def test_the_entropy_coefficient_goes_on(tmp_path):
+    learning = SB3(SAC, total_timesteps=200, num_envs=4, learning_starts=40, buffer_size=1000, learning_rate=1e-2)
+    policy = learning(make_worlds, None, np.random.default_rng(0))
+    assert policy.variables["log_ent_coef"] < -0.1  # 0 at the start
+    learning.save(policy, tmp_path / "sac.pt")
+    loaded = learning.load(tmp_path / "sac.pt")
+    waiting = SB3(SAC, total_timesteps=0, num_envs=4, buffer_size=1000)
+    further = waiting(make_worlds, loaded, np.random.default_rng(1))
+    assert policy.variables == loaded.variables == further.variables
+
+
+def global_states():
+    return random.getstate(), np.random.get_state()[1].tolist(), torch.get_rng_state().tolist()  # noqa: NPY002
+
+
+def test_global_generators_are_left_as_they_were(tmp_path):
+    trainer = SB3(total_timesteps=16, num_envs=2, n_steps=8, batch_size=8)
+    before = global_states()
+    policy = trainer(make_worlds, None, np.random.default_rng(0))
+    assert global_states() == before
+    trainer.save(policy, tmp_path / "policy.pt")
+    trainer.load(tmp_path / "policy.pt")
+    assert global_states() == before
 
 
 def test_spaces_that_cannot_be_saved_are_named(tmp_path):

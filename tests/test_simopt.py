@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from toy_reach import SPACE, LeanTrainer, PushPolicy, ReachEnv
 
-from simopt_envs.adaptation import Discrepancy, EnvSimulator, HiddenSystem, SimOpt
+from simopt_envs.adaptation import Discrepancy, EnvSimulator, HiddenSystem, RecordedSystem, SimOpt
 from simopt_envs.adaptation.search import is_stuck, own_and_far, sample_further_out, update_further_out
 from simopt_envs.adaptation.updates import REPS
 from simopt_envs.distributions import Gaussian
@@ -19,7 +19,7 @@ START = Gaussian.around_nominal(XI, std=[0.2, 0.2])
 def make(target=None, seed=0, **changes):
     system = changes.pop("real_system", None) or HiddenSystem("Toy/Reach-v0", target or {}, noise=0.002, dropout=0.05)
     arguments = {"trainer": LeanTrainer(), "simulated_rollouts": 300, "evaluation_episodes": 20} | changes
-    return SimOpt("Toy/Reach-v0", START, real_system=system, seed=seed, **arguments)
+    return SimOpt(env_id="Toy/Reach-v0", distribution=START, real_system=system, seed=seed, **arguments)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -151,6 +151,35 @@ def test_a_fixed_policy_is_kept():
     assert last.policy is policy
     assert last.train_steps == 0
     assert last.distribution.median[1] == pytest.approx(0.4, abs=0.03)
+
+
+@pytest.mark.parametrize("trainer", [None, LeanTrainer()])
+def test_recordings_are_replayed(trainer):
+    """Whatever policy made them, and also where one of another lean is trained."""
+    recorder = HiddenSystem("Toy/Reach-v0", {"force": 0.4})
+    recordings = RecordedSystem(recorder.rollout(PushPolicy(lean=-1.5), 3, np.random.default_rng(0)))
+    *_, last = make(real_system=recordings, trainer=trainer).run(2)
+    assert last.distribution.median[1] == pytest.approx(0.4, abs=0.05)
+    assert last.verdict.label == "explained"
+    assert last.discrepancy_min < 0.1
+    np.testing.assert_array_equal(last.simulated[0].actions, last.real[0].actions)
+
+
+def test_a_policy_that_recordings_were_made_with_acts():
+    policy = PushPolicy(lean=-1.5)
+    recordings = HiddenSystem("Toy/Reach-v0", {"force": 0.4}).rollout(policy, 3, np.random.default_rng(0))
+    *_, last = make(real_system=RecordedSystem(recordings), trainer=None, policy=policy).run(2)
+    assert last.distribution.median[1] == pytest.approx(0.4, abs=0.05)
+    assert np.abs(last.simulated[0].actions - last.real[0].actions).max() > 0
+
+
+def test_an_environment_that_does_not_begin_where_it_is_told_is_told_before_any_training():
+    class Restless(ReachEnv):
+        def reset(self, *, seed=None, options=None):
+            return super().reset(seed=seed)
+
+    with pytest.raises(ValueError, match="Restless ignores"):
+        SimOpt(EnvSimulator(Restless), START, LeanTrainer(), HiddenSystem(ReachEnv, {}))
 
 
 def test_diverged_simulations_do_not_count():

@@ -1,15 +1,21 @@
 """The single and the vector environment over one task: same trajectories, autoreset, ξ per world, divergence."""
 
+import copy
+import pickle
+
+import gymnasium as gym
 import numpy as np
 import pytest
-from conftest import needs_batch
+from conftest import needs_batch, needs_effects
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 from toy_task import ToyTask
 
+import simopt_envs  # noqa: F401 - registers the environments
 from simopt_envs.tasks.env import TaskEnv
 
 pytestmark = needs_batch
+for_both_tasks = pytest.mark.parametrize("env_id", ["SimOpt/Drawer-v0", "SimOpt/SwingPeg-v0"])
 
 
 def vector_env(num_envs, **kwargs):
@@ -73,6 +79,13 @@ def test_parameters_are_in_force_for_one_episode_and_reported():
     np.testing.assert_array_equal(env.simulation.model_field("body_mass")[:, 1], [1.0, 1.0])
 
 
+def test_parameters_none_leaves_xi_to_the_source():
+    env = vector_env(2)
+    env.parameter_source = lambda worlds: np.tile([4.0, 2.0], (len(worlds), 1))
+    _, info = env.reset(seed=0, options={"parameters": None})
+    np.testing.assert_array_equal(info["parameters"], [[4.0, 2.0]] * 2)
+
+
 @pytest.mark.parametrize("env", [lambda: vector_env(2), lambda: TaskEnv(ToyTask())])
 @pytest.mark.parametrize(
     ("options", "message"),
@@ -91,6 +104,42 @@ def test_bad_options_are_refused_before_anything_changes(env, options, message):
     with pytest.raises(ValueError, match=message):
         env.reset(options=options)
     np.testing.assert_array_equal(env.simulation.data("qpos"), before)
+
+
+@pytest.mark.parametrize(
+    ("env", "action", "message"),
+    [
+        (lambda: TaskEnv(ToyTask()), [np.nan], "action is not finite: .*nan"),
+        (lambda: TaskEnv(ToyTask()), [np.inf], "action is not finite: .*inf"),
+        (lambda: vector_env(3), [[0.0], [np.nan], [0.0]], "action of world 1 is not finite: .*nan"),
+    ],
+)
+def test_actions_that_are_not_finite_are_refused(env, action, message):
+    env = env()
+    before, _ = env.reset(seed=0)
+    with pytest.raises(ValueError, match=message):
+        env.step(np.array(action))
+    np.testing.assert_array_equal(env.simulation.data("qpos").reshape(before.shape), before)
+
+
+@pytest.mark.parametrize(("given", "horizon"), [(7, 7), (None, 50), (-1, None)])
+def test_horizons_are_given_as_gymnasium_has_them(given, horizon):
+    env = vector_env(2, max_episode_steps=given, render_mode=None)
+    env.reset(seed=0)
+    ends = [step for step in range(1, 61) if env.step(np.zeros((2, 1)))[3].all()]
+    assert ends[:1] == ([] if horizon is None else [horizon])
+
+
+@pytest.mark.parametrize(
+    ("keywords", "message"),
+    [
+        ({"max_episode_steps": 0}, "max_episode_steps must be at least 1, or -1 for no limit, got 0"),
+        ({"render_mode": "rgb_array"}, "does not render.*'rgb_array'.*vectorization_mode"),
+    ],
+)
+def test_keywords_that_it_cannot_take_are_refused(keywords, message):
+    with pytest.raises(ValueError, match=message):
+        vector_env(2, **keywords)
 
 
 def test_initial_observation_sets_the_start():
@@ -175,10 +224,50 @@ def test_a_diverged_world_is_reset_counted_and_alone(mode):
             assert not info["diverged"].any()
 
 
-def test_single_env_reports_divergence():
-    env = TaskEnv(ToyTask())
-    env.reset(seed=0)
-    env.data.qvel[0] = np.nan
-    *_, truncated, info = env.step(np.ones(1))
-    assert truncated
-    assert info["diverged"]
+def test_a_world_diverges_alike_in_the_single_and_the_vector_env():
+    single, vector = TaskEnv(ToyTask()), vector_env(1)
+    single.reset(seed=0)
+    vector.reset(seed=0)
+    last, *_ = single.step(np.ones(1))
+    vector.step(np.ones((1, 1)))
+    single.data.qvel[0] = vector.simulation.data("qvel")[0] = np.nan
+    observation, reward, terminated, truncated, info = single.step(np.ones(1))
+    np.testing.assert_array_equal(observation, last)
+    assert (reward, terminated, truncated) == (0.0, False, True)
+    assert info == {"is_success": False, "diverged": True, "reward_terms": {"distance": 0.0}}
+    *expected, infos = vector.step(np.ones((1, 1)))
+    for ours, theirs in zip((observation, reward, terminated, truncated), expected, strict=True):
+        np.testing.assert_allclose(ours, theirs[0], atol=1e-9)
+    assert not infos["is_success"][0]
+    assert infos["diverged"][0]
+
+
+@for_both_tasks
+def test_frames_are_collected_and_an_unknown_render_mode_is_refused(env_id):
+    assert gym.make(env_id, render_mode="rgb_array_list").render_mode == "rgb_array_list"
+    with (
+        pytest.warns(UserWarning, match="not in the possible render_modes"),
+        pytest.raises(ValueError, match=r"unknown render mode 'rgb'.*human, rgb_array"),
+    ):
+        gym.make(env_id, render_mode="rgb")
+
+
+@needs_effects
+@for_both_tasks
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_a_copy_is_a_new_environment_of_the_same_task(env_id, copied):
+    payload = {"effect": "payload", "where": "body:link5", "parameters": {"mass": 1.0}}
+    env = gym.make(env_id, effects=[payload], render_mode="rgb_array").unwrapped
+    twin = copied(env)
+    assert twin.parameters == env.parameters
+    assert twin.render_mode == "rgb_array"
+    acts = np.random.default_rng(0).uniform(-1, 1, (3, *env.action_space.shape))
+    np.testing.assert_array_equal(rollout(twin, acts, seed=2), rollout(env, acts, seed=2))
+
+
+@for_both_tasks
+def test_latency_acts_up_to_its_bound(env_id):
+    env = gym.make_vec(env_id, num_envs=3)
+    env.reset(seed=[0] * 3, options={"parameters": {"latency": [0.032, 0.036, 0.04]}})
+    observation, *_ = env.step(np.ones(env.action_space.shape))
+    assert np.all(np.diff(np.abs(observation[:, 0] - env.reset(seed=[0] * 3)[0][:, 0])) < -1e-6)

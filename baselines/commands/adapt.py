@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import shlex
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -13,8 +15,7 @@ import tyro
 
 from baselines.commands import inputs
 from baselines.commands.engines import EngineOptions
-from baselines.commands.gap import environment, explain, told, ways_on
-from baselines.commands.parameter_file import read_parameters
+from baselines.commands.gap import explain, told, ways_on
 from baselines.commands.progress import Display
 from baselines.commands.recordings import HeldOut, read_split
 from baselines.commands.runs import conclude, control_period, interruptible, run_loop
@@ -24,6 +25,7 @@ from simopt_envs.adaptation.checkpoint import write_json
 from simopt_envs.adaptation.fitting import CMAES, LeastSquares, WindowMisfit, untold_combinations
 from simopt_envs.adaptation.updates import Update
 from simopt_envs.distributions import Gaussian
+from simopt_envs.distributions.parameter_file import read_parameters
 from simopt_envs.engine import ThreadEngine
 from simopt_envs.physics import ModelWriter
 from simopt_envs.physics.effects import require_mujoco
@@ -69,6 +71,8 @@ class Adapt:
     """Model: YAML file that names the columns of foreign logs."""
     window: float = 0.5
     """Model: seconds of each stretch of a recording that is replayed."""
+    keyframe: str | None = None
+    """Model: where joints start that no column tells of; its reference by default."""
     held_out: tuple[Path, ...] = ()
     """Model: recordings that no fit sees, to say what the adapted model is worth."""
     held_out_fraction: float = 0.25
@@ -102,7 +106,7 @@ class Adapt:
 
     def _adapt_environment(self, typed: str) -> None:
         self._refuse("the model", "an environment", data=self.data, parameters=self.parameters, mapping=self.mapping)
-        self._refuse("the model", "an environment", **{"held-out": self.held_out})
+        self._refuse("the model", "an environment", keyframe=self.keyframe, **{"held-out": self.held_out})
         if self.update in _FITS:
             raise ValueError(f"--update {self.update} fits recordings; for an environment take reps or cem")
         if self.target is None:
@@ -153,6 +157,8 @@ class Adapt:
         if self.explain:
             try:
                 require_mujoco()
+                from simopt_envs.gap.environments import environment
+
                 environment(self.system, prior)
             except (ImportError, ValueError) as reason:
                 display.say(f"Nothing will look for what p(ξ) cannot explain: {reason}")
@@ -198,8 +204,8 @@ class Adapt:
         recordings, held_out = read_split(
             model, self.data, self.held_out, self.held_out_fraction, self.window, self.mapping
         )
-        windows = cut_windows(model, recordings, self.window)
-        held_out_windows = cut_windows(model, held_out, self.window) if held_out else None
+        cut = partial(cut_windows, model, seconds=self.window, keyframe=self.keyframe)
+        windows, held_out_windows = cut(recordings), cut(held_out) if held_out else None
         misfit = WindowMisfit(model, windows, prior)
         trajectories = window_trajectories(windows)
         is_fit = self.update in _FITS
@@ -219,7 +225,8 @@ class Adapt:
             on_event=display.event,
         )
         warnings = tuple(map(str, warnings_of([*recordings, *held_out])))
-        details = Details(typed, Path(self.system).name, float(windows.offsets[1]), notes=warnings)
+        units = {channel.name: channel.unit for channel in windows.channels}
+        details = Details(typed, Path(self.system).name, float(windows.offsets[1]), notes=warnings, channel_units=units)
         iterations = min(self.iterations, 1) if is_fit else self.iterations
         last = run_loop(loop, iterations, display, details, resume_with(typed), resume=self.resume)
         posterior = misfit.laplace(misfit.coordinates(last.distribution.mean))
@@ -233,9 +240,10 @@ class Adapt:
             findings = ["Nothing was held out, so nothing here shows what the model is worth on new data.", *findings]
         write_json(self.out / "result.json", result)
         conclude(self.out, findings, display)
-        logs = " ".join(map(str, self.data))
-        mapping = "" if self.mapping is None else f" --mapping {self.mapping}"
-        display.say(f"what no ξ explains: simopt-envs gap {self.system} --data {logs}{mapping} --out {self.out / _GAP}")
+        options = {"--mapping": self.mapping, "--keyframe": self.keyframe, "--out": self.out / _GAP}
+        given = [str(word) for option in options.items() if option[1] is not None for word in option]
+        ask = shlex.join(["simopt-envs", "gap", self.system, "--data", *map(str, self.data), *given])
+        display.say(f"what no ξ explains: {ask}")
 
     def _update(self) -> Update:
         return REPS(epsilon=self.epsilon) if self.update == "reps" else CEM(epsilon=self.epsilon)

@@ -12,28 +12,23 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import gymnasium as gym
-import mujoco
-import numpy as np
 import tyro
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from baselines.commands.engines import EngineOptions
-from baselines.commands.inputs import distribution, existing, require_free
-from baselines.commands.parameter_file import read_parameters
+from baselines.commands.inputs import existing, require_free
 from baselines.commands.progress import SECONDS_BETWEEN_LINES
 from baselines.commands.recordings import existing_logs
+from baselines.commands.runs import interruptible
 from simopt_envs.distributions import Gaussian
 from simopt_envs.engine import Engine, ThreadEngine
 from simopt_envs.measured import load_recording, load_recordings
 from simopt_envs.measured.recording import Finding
-from simopt_envs.physics import Parameter, ParameterSpace
-from simopt_envs.physics.spec_writer import write_spec
 
 if TYPE_CHECKING:
     from simopt_envs.gap.search import Progress as Shown
 
-_HOME = "home"  # keyframe of an environment's model where its joints are when an episode begins
 _FITS = ".fits"
 _EXPLAINED = "Parameters within p(ξ) explain the measured rollouts: what is left is noise."
 
@@ -47,10 +42,10 @@ class Gap:
     data: tuple[Path, ...]
     """Recordings; half of them are held out."""
     out: Path
-    """Folder for gap.json, report.html, model.repaired.xml, model.diff and plots. The same command goes on from the
-    fits that are finished, if it was stopped."""
+    """Folder for gap.json, report.html, model.repaired.xml, model.diff and plots, and columns.yaml where MJCF cannot
+    hold all that was found. The same command goes on from the fits that are finished, if it was stopped."""
     mapping: Path | None = None
-    """YAML file that names the columns of foreign logs."""
+    """YAML file that names the columns of foreign logs, and may say what they show, as columns.yaml does."""
     config: Path | None = None
     """YAML file of plain parameters and their priors; by default masses, inertias, armature, damping, gains, latency;
     of an environment of this package the first p(ξ) of adapt."""
@@ -79,27 +74,20 @@ class Gap:
         ]
         if not (self.out / _FITS).exists():  # a run that was stopped goes on, wherever it was
             require_free(self.out)
-        model: str | mujoco.MjSpec = self.model
-        keyframe, plain = self.keyframe, None
-        if self.model in gym.registry:
-            model, plain = _model_of(self.model)
-            keyframe = keyframe or (None if plain is None else _HOME)
-        if self.config is not None:
-            plain = read_parameters(self.config)
         engine, console = self.where.make(local=ThreadEngine), Console(highlight=False)
-        with _shown(console) as show:
+        with interruptible(typed), _shown(console) as show:
             gap = find_gap(
-                model,
+                self.model,
                 recordings,
-                plain=plain,
-                keyframe=keyframe,
+                config=self.config,
+                keyframe=self.keyframe,
                 progress=show,
                 engine=engine,
                 directory=self.out / _FITS,
             )
-        console.print(str(gap))
-        console.print(f"report: {gap.save(self.out) / 'report.html'}")
+        report = gap.save(self.out) / "report.html"
         shutil.rmtree(self.out / _FITS)
+        console.print(f"{gap}\nreport: {report}", markup=False, soft_wrap=True)
 
 
 def explain(
@@ -131,6 +119,7 @@ def explain(
     Raises:
         ValueError: for logs that cannot be read as recordings of the environment.
     """
+    from simopt_envs.gap.environments import HOME, environment
     from simopt_envs.gap.find import read, refitted, solve
     from simopt_envs.gap.thresholds import EXPLAINED
     from simopt_envs.gap.trial import of_median_window
@@ -142,7 +131,7 @@ def explain(
         tried = []
         for distribution in distributions:
             spec, plain = environment(env_id, distribution)
-            problem = read(spec, recordings, plain, keyframe=_HOME)
+            problem = read(spec, recordings, plain, keyframe=HOME)
             null = refitted(problem, show)
             tried.append((of_median_window(null.held_out.errors), problem, null))
             if tried[-1][0] < EXPLAINED:
@@ -191,64 +180,10 @@ def ways_on(env_id: str, folder: Path) -> list[str]:
     return lines
 
 
-def _model_of(env_id: str) -> tuple[mujoco.MjSpec, Gaussian | None]:
-    """The model of any environment; with it, of one of this package, the first p(ξ) of adapt.
-
-    Raises:
-        ValueError: where it runs no MJCF file that can be told.
-    """
-    env: Any = gym.make(env_id).unwrapped
-    env.close()
-    file = getattr(env, "fullpath", None)  # Gymnasium's name for it, and gymnasium-robotics'
-    return environment(env_id) if file is None else (mujoco.MjSpec.from_file(file), None)
-
-
-def environment(env_id: str, current: Gaussian | None = None) -> tuple[mujoco.MjSpec, Gaussian]:
-    """The model of an environment of this package, and p(ξ) as plain parameters.
-
-    Recordings hold what the drives were commanded, so that parameters of what the task makes of actions say nothing.
-
-    Args:
-        env_id: the environment.
-        current: p(ξ), whose median the model then has; None for the first p(ξ) of adapt, around nominal.
-
-    Raises:
-        ValueError: for an environment without a task, or without a first p(ξ) where that is wanted.
-    """
-    env = gym.make(env_id)
-    task: Any = getattr(env.unwrapped, "task", None)
-    env.close()
-    if not hasattr(task, "make_spec"):
-        raise ValueError(f"{env_id} has no task with a model to repair; give its MJCF file")
-    space: ParameterSpace = task.parameters
-    prior = distribution(env_id, space, ()) if current is None else current
-    mechanical = [p.name for p in prior.space if any(write.field != "numeric_data" for write in p.writes)]
-    spec, plain = task.make_spec(), prior.marginal(mechanical)
-    return spec, plain if current is None else _moved(spec, plain)
-
-
-def _moved(spec: mujoco.MjSpec, prior: Gaussian) -> Gaussian:
-    """Put the median of p(ξ) into a spec, in place; p(ξ) with parameters that count from there.
-
-    Where joints that no column tells of start is estimated with the model as given: a drawer seen by its handle is not
-    where it was if the cabinet is not.
-    """
-    median = np.clip(prior.median, prior.space.low, prior.space.high)
-    write_spec(spec, spec.compile(), prior.space, median)
-
-    def from_there(parameter: Parameter, value: float) -> Parameter:
-        if any(write.operation == "add" for write in parameter.writes):
-            return replace(parameter, nominal=0.0, low=parameter.low - value, high=parameter.high - value)
-        return replace(parameter, nominal=value, baseline=None)
-
-    space = ParameterSpace(map(from_there, prior.space, median.tolist()))
-    return Gaussian(space, space.to_unconstrained(space.nominal), prior.covariance)
-
-
 @contextmanager
 def _shown(console: Console) -> Iterator[Shown]:
     """A bar for what a search tells of its progress; lines where that is no terminal."""
-    columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()
+    columns = TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn()
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task, last_line = bar.add_task("reading", total=None), time.monotonic()
 
@@ -257,6 +192,7 @@ def _shown(console: Console) -> Iterator[Shown]:
             bar.update(task, description=what, completed=done, total=total)
             if not console.is_terminal and time.monotonic() - last_line > SECONDS_BETWEEN_LINES:
                 last_line = time.monotonic()
-                console.print(f"looking for what is missing: {what} {done} of {total}")
+                line = f"looking for what is missing: {what} {done} of {total}"
+                console.print(line, markup=False, soft_wrap=True)
 
         yield show

@@ -3,41 +3,17 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
-from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, Literal
 
+from simopt_envs.adaptation.first import FIRST_STD, first_distribution
 from simopt_envs.adaptation.protocols import Trainer
 from simopt_envs.distributions import Gaussian
+from simopt_envs.distributions.parameter_file import is_number, read_text
 from simopt_envs.physics import ParameterSpace
 from simopt_envs.physics.parameters import unknown_name
-
-DEFAULT_VARY: Mapping[str, Mapping[str, float]] = {
-    # What differs from one kitchen to the next: where the cabinet stands, narrowly, as in the paper, and how its drawer
-    # runs and grips. The arm is taken as calibrated; --vary "joint_gain_*=0.1" and the like say otherwise.
-    "SimOpt/Drawer-v0": {
-        "cabinet_*": 0.02,
-        "drawer_damping": 0.2,
-        "drawer_friction": 0.2,
-        "drawer_mass": 0.2,
-        "handle_friction": 0.2,
-    },
-    # A swing is over in a second and follows no correction, so little may vary at a time for a policy to work at all.
-    "SimOpt/SwingPeg-v0": {
-        "joint_gain_*": 0.03,
-        "joint_damping_*": 0.03,
-        "action_scaling_*": 0.02,
-        "rope_segment_length": 0.03,
-        "rope_bending_*": 0.1,
-        "rope_density": 0.05,
-        "peg_mass": 0.05,
-        "peg_friction": 0.1,
-    },
-}
-"""First standard deviations by environment: relative for logarithmic parameters, else in the parameter's unit."""
 
 UPDATES = 20
 """Updates of p(ξ) per iteration: at most 1.4 standard deviations each, they cross several centimetres of cabinet, or
@@ -97,16 +73,13 @@ def distribution(env_id: str, space: ParameterSpace, vary: Sequence[str]) -> Gau
     Raises:
         ValueError: for a text of another form, a name that matches nothing, or no default for this environment.
     """
-    if not vary and env_id not in DEFAULT_VARY:
+    if not vary and env_id not in FIRST_STD:
         raise ValueError(f"say what varies with --vary NAME=STD ...; {env_id} has {', '.join(space.names)}")
-    stds = dict(map(_name_and_std, vary)) if vary else DEFAULT_VARY[env_id]
-    chosen: dict[str, float] = {}
-    for pattern, std in stds.items():
-        matching = [name for name in space.names if fnmatchcase(name, pattern)]
-        if not matching:
-            raise ValueError(f"--vary: {unknown_name('parameter', pattern, space.names)}")
-        chosen |= dict.fromkeys(matching, std)
-    return Gaussian.around_nominal(space.subset(list(chosen)), list(chosen.values()))
+    std = dict(map(_name_and_std, vary)) if vary else FIRST_STD[env_id]
+    try:
+        return first_distribution(space, std)
+    except ValueError as error:
+        raise ValueError(f"--vary: {error}") from None
 
 
 def make_trainer(name: Literal["torch", "sb3"], on_progress: Any = None) -> Trainer[Any]:
@@ -138,18 +111,6 @@ def existing(paths: Iterable[Path]) -> list[Path]:
         if not path.exists():
             raise FileNotFoundError(f"there is no file {path}")
     return found
-
-
-def read_text(path: Path, what: str) -> str:
-    """Content of a file; FileNotFoundError saying what it would have been."""
-    if not path.is_file():
-        raise FileNotFoundError(f"there is no {what} {path}")
-    return path.read_text(encoding="utf-8")
-
-
-def is_number(value: Any) -> bool:
-    """Whether a value read from JSON or YAML is a finite number."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def _name_and_std(text: str) -> tuple[str, float]:

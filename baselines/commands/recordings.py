@@ -89,7 +89,9 @@ class HeldOut:
     @classmethod
     def of(cls, model: mujoco.MjModel, windows: Windows, before: Gaussian, after: Gaussian) -> HeldOut:
         """Replay the windows at the medians of two distributions over the same parameters."""
-        simulated = WindowSimulator(model, windows, before.space)(np.array([before.median, after.median]))
+        space = before.space
+        medians = np.clip([before.median, after.median], space.low, space.high)  # a fit may end at a bound, rounded
+        simulated = WindowSimulator(model, windows, space)(medians)
         rmse = Replay(windows, simulated, np.zeros_like(windows.measured)).rmse
         return cls(
             tuple(dict.fromkeys(windows.recording)),

@@ -43,6 +43,7 @@ def run_loop(
     """
     steps = loop.run(iterations, resume=resume)  # raises before anything is written
     assert loop.directory is not None
+    strip = loop.directory / STRIP
     details.save(loop.directory)
     with interruptible(resume_with):
         with display:
@@ -50,9 +51,11 @@ def run_loop(
                 if step.index == 0:
                     first = step
                 display.iteration(step)
+                if display.computed:
+                    strip.unlink(missing_ok=True)  # it shows other policies
                 if enough(step):
                     break
-        if film is not None and (display.computed or not (loop.directory / STRIP).exists()):
+        if film is not None and not strip.exists():
             display.say("filming the policy on the target")
             details = _film(film, {"before adaptation": first, f"after iteration {step.index}": step}, loop, details)
     details.save(loop.directory)

@@ -42,21 +42,7 @@ class OpenLoop:
         self, policy: Policy | None, space: ParameterSpace, xi: Array, real: Sequence[Trajectory], seed: int
     ) -> Rollouts:
         """See :meth:`Simulator.rollout`."""
-        each = [self._simulator.rollout(_Replay(t.actions), space, xi, [t], seed).map(lambda x: x[:, 0]) for t in real]
-        swapped = Rollouts.concatenate(each)  # (r n), one measured episode after the other
-        return swapped.map(lambda x: x.reshape(len(real), len(xi), *x.shape[1:]).swapaxes(0, 1))
-
-
-class _Replay:
-    """A policy that repeats actions (T, a) over and over, whatever it sees; all episodes must have T steps."""
-
-    def __init__(self, actions: Array):
-        self._actions, self._step = actions, 0
-
-    def act(self, observations: Array) -> Array:
-        action = self._actions[self._step % len(self._actions)]
-        self._step += 1
-        return np.tile(action, (len(observations), 1))
+        return self._simulator.rollout(None, space, xi, real, seed)
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ import gymnasium as gym
 import simopt_envs  # noqa: F401 - registers the environments
 from baselines.commands import inputs
 from simopt_envs.adaptation import EnvSimulator
+from simopt_envs.adaptation.first import FIRST_STD
 from simopt_envs.distributions import Gaussian
 from wrappers import AdaptableEnv
 
@@ -64,7 +65,7 @@ class Randomization:
     @classmethod
     def default(cls, env: str, wider: Mapping[str, float] = MappingProxyType({})) -> Randomization:
         """What ``simopt-envs adapt`` starts with, some of it wider."""
-        return cls(env, {**inputs.DEFAULT_VARY[env], **wider})
+        return cls(env, {**FIRST_STD[env], **wider})
 
     @classmethod
     def none(cls, env: str) -> Randomization:

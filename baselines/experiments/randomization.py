@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from baselines.commands.inputs import DEFAULT_VARY
 from baselines.experiments.cell import Cell, Result, Results
 from baselines.experiments.document import Question, Table
 from baselines.experiments.drawing import as_percent, draw_points, style
@@ -15,6 +14,7 @@ from baselines.experiments.environments import DRAWER, PEG, Randomization
 from baselines.experiments.settings import Instance, Train
 from baselines.experiments.statistics import Estimate, mean_of, success_of
 from baselines.experiments.targets import PEG_TARGETS, QUICK_SEEDS, SHIFTS, drawer, drawer_cure, peg, peg_cure
+from simopt_envs.adaptation.first import FIRST_STD
 
 _NAME = "randomization"
 _SEEDS = range(5)
@@ -27,7 +27,7 @@ _CLOSE = {
 _INSTANCES = {"drawer": 24, "peg": 12}
 _SOLVED = 0.5  # success from which an instance counts as feasible
 EPISODE_STEPS = 50
-_UNSHIFTED = {name: std for name, std in DEFAULT_VARY[DRAWER].items() if not name.startswith("cabinet")}
+_UNSHIFTED = {name: std for name, std in FIRST_STD[DRAWER].items() if not name.startswith("cabinet")}
 _ARM = {"joint_gain_*": 0.15, "action_scaling_*": 0.3}
 
 FIXED: Mapping[str, Mapping[str, Randomization]] = {

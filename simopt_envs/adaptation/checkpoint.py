@@ -88,8 +88,9 @@ class Checkpoint:
             directory.mkdir(parents=True, exist_ok=True)
             write_json(run, settings)
         (directory / _PHASES).mkdir(exist_ok=True)
-        for unfinished in (directory / _PHASES).glob(".*"):
-            shutil.rmtree(unfinished)
+        for hidden in (directory / _PHASES).glob(".*"):
+            if hidden.is_dir():  # an unfinished phase; no file of the file manager's
+                shutil.rmtree(hidden)
 
     def folder(self, phase: str) -> Path:
         """Where a finished phase's files are."""

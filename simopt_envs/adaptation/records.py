@@ -50,7 +50,8 @@ class Iteration:
         simulated: the episodes of the best of these ξ, one for each of ``real``.
         verdict: whether these ξ explain ``real``.
         target_success: share of successes on the real system: of its evaluation, or else of ``real``, or None.
-        sim_success: share of successes in the simulations of ``xi``, or None.
+        sim_success: share of successes in those simulations of ``xi`` that came to their end within the length of the
+            measured episodes, or None.
         train_seconds: wall time of the training.
         train_steps: control steps of the training.
         sim_rollouts: simulated episodes since the iteration before, outside the training.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from threading import Lock
 from typing import Any
 
 import mujoco
@@ -55,13 +56,16 @@ class ReplaySimulator:
         self.discrepancy_weights: Array | None = 1 / np.where(scale > 0, scale, 1.0)
         self.engine: Engine = engine or LocalEngine()
         self._model, self._windows, self._num_threads = model, windows, self.engine.num_threads
-        self._index = {measured.tobytes(): i for i, measured in enumerate(windows.measured)}
+        looks = zip(windows.measured, windows.commands[:, :: windows.stride], strict=True)
+        self._index = {_key(measured, commands): i for i, (measured, commands) in enumerate(looks)}
         self._simulator: tuple[tuple[int, ...], ParameterSpace, WindowSimulator] | None = None
+        self._in_use = Lock()
 
     def identity(self) -> dict[str, Any]:
         """What identifies it in a checkpoint."""
         parameters = {"parameters": self.parameters.names, "parameters_digest": digest(tuple(self.parameters))}
-        return {**parameters, "model_digest": digest(self._model), "windows": len(self._windows)}
+        windows = {"windows": len(self._windows), "starts_digest": digest(self._windows.starts)}
+        return {**parameters, "model_digest": digest(self._model), **windows}
 
     def make_vector_env(self, num_envs: int, distribution: Sampler, seed: int) -> VectorEnv:
         """There is nothing to train in.
@@ -88,22 +92,34 @@ class ReplaySimulator:
         return Rollouts(observations, actions, np.full((n, r), samples - 1), diverged, None)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without what belongs to this process: the simulator, and the engine."""
-        return self.__dict__ | {"_simulator": None, "engine": None}
+        """Without what belongs to this process: the simulator, who uses it, and the engine."""
+        return self.__dict__ | {"_simulator": None, "_in_use": None, "engine": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__ = state | {"_in_use": Lock()}
 
     def _find(self, trajectory: Trajectory) -> int:
-        index = self._index.get(trajectory.observations.tobytes())
+        index = self._index.get(_key(trajectory.observations, trajectory.actions))
         if index is None:
             raise ValueError("a trajectory to replay is none of the simulator's windows")
         return index
 
-    def _simulate(self, chosen: tuple[int, ...], space: ParameterSpace) -> WindowSimulator:
-        """The simulator of some windows; the last one is kept, as updates come several on the same windows."""
-        if self._simulator is None or self._simulator[:2] != (chosen, space):
-            windows = self._windows.select(np.array(chosen))
-            self._simulator = chosen, space, WindowSimulator(self._model, windows, space, self._num_threads)
-        return self._simulator[2]
+    def _simulate(self, xi: Array, chosen: tuple[int, ...], space: ParameterSpace) -> Array:
+        """Some windows for ξ (n, d); of several threads, one at a time.
+
+        Their simulator is kept, as updates come several on the same windows.
+        """
+        with self._in_use:
+            if self._simulator is None or self._simulator[:2] != (chosen, space):
+                windows = self._windows.select(np.array(chosen))
+                self._simulator = chosen, space, WindowSimulator(self._model, windows, space, self._num_threads)
+            return self._simulator[2](xi)
+
+
+def _key(observations: Array, actions: Array) -> tuple[bytes, bytes]:
+    """What a window is found by: a joint that sticks looks the same under many a command."""
+    return observations.tobytes(), actions.tobytes()
 
 
 def _replay(xi: Array, simulator: ReplaySimulator, chosen: tuple[int, ...], space: ParameterSpace) -> Array:
-    return simulator._simulate(chosen, space)(xi)
+    return simulator._simulate(xi, chosen, space)

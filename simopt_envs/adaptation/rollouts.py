@@ -24,14 +24,15 @@ class Rollouts:
         actions: (..., T, a), NaN after an episode's end.
         lengths: (...), steps of each episode.
         diverged: (...), whether the simulation broke down.
-        success: (...), whether the episode ended in success; None where the environment does not tell.
+        success: (...), 1 where the episode ended in success, 0 where it did not, NaN where it was cut off before its
+            end; None where the environment does not tell.
     """
 
     observations: Array
     actions: Array
     lengths: NDArray[np.int64]
     diverged: NDArray[np.bool_]
-    success: NDArray[np.bool_] | None
+    success: Array | None
 
     @classmethod
     def concatenate(cls, parts: Sequence[Rollouts]) -> Rollouts:
@@ -69,17 +70,19 @@ class Rollouts:
     def trajectory(self, *index: int) -> Trajectory:
         """One of the episodes."""
         steps = int(self.lengths[index])
-        return Trajectory(
-            self.observations[index][: steps + 1].copy(),
-            self.actions[index][:steps].copy(),
-            None if self.success is None else bool(self.success[index]),
-        )
+        success = None if self.success is None or np.isnan(self.success[index]) else bool(self.success[index])
+        return Trajectory(self.observations[index][: steps + 1].copy(), self.actions[index][:steps].copy(), success)
+
+    def success_rate(self) -> float | None:
+        """The share of successes among the episodes of which it is known; None where it is of none."""
+        known = None if self.success is None else self.success[np.isfinite(self.success)]
+        return None if known is None or not known.size else float(known.mean())
 
 
 def run_episodes(
     env: VectorEnv,
     policy: Policy,
-    max_steps: int | None = None,
+    max_steps: NDArray[np.int64] | None = None,
     *,
     seed: list[int],
     options: dict[str, Any] | None = None,
@@ -90,7 +93,7 @@ def run_episodes(
     Args:
         env: n worlds.
         policy: decides on all of them at once.
-        max_steps: longest episode; None leaves it to the environment.
+        max_steps: where each episode is cut off, (n,); None leaves its end to the environment.
         seed: of each world's episode, n.
         options: of ``reset``.
         sensor: observations (n, o) -> what is measured of them, NaN where nothing is: there the policy goes on seeing
@@ -98,6 +101,9 @@ def run_episodes(
 
     Returns:
         Rollouts with one leading axis, n.
+
+    Raises:
+        ValueError: for a policy that does not return one action per world.
     """
     measure = sensor or (lambda observation: observation)
     first, _ = env.reset(seed=seed, options=options)  # type: ignore[arg-type]  # a list, as every VectorEnv takes it
@@ -105,20 +111,26 @@ def run_episodes(
     n = env.num_envs
     observations, actions = [seen], list[Array]()
     lengths = np.zeros(n, dtype=np.int64)
-    running = np.ones(n, dtype=bool)
-    diverged = np.zeros(n, dtype=bool)
-    success: NDArray[np.bool_] | None = None
-    while running.any() and (max_steps is None or len(actions) < max_steps):
+    limits = np.full(n, np.inf) if max_steps is None else max_steps
+    running = limits > 0
+    ended, diverged = np.zeros((2, n), dtype=bool)
+    success: Array | None = None
+    while running.any():
         action = np.asarray(policy.act(seen))
+        if action.shape[:1] != (n,):
+            raise ValueError(f"a policy must return one action for each of {n} observations, got shape {action.shape}")
         observation, _, terminated, truncated, info = env.step(action)
         measured = measure(np.array(observation, dtype=np.float64))
         observations.append(np.where(running[:, None], measured, np.nan))
-        actions.append(np.where(running[:, None], action, np.nan))
+        actions.append(np.where(running[:, None], action.reshape(n, -1), np.nan))
         seen = np.where(np.isnan(measured), seen, measured)
         lengths += running
         diverged |= running & np.asarray(info.get("diverged", False), dtype=bool)
         if "is_success" in info:
-            success = np.zeros(n, dtype=bool) if success is None else success
+            success = np.zeros(n) if success is None else success
             success = np.where(running, np.asarray(info["is_success"], dtype=bool), success)
-        running &= ~(terminated | truncated)
+        ended |= running & (terminated | truncated)
+        running &= ~ended & (len(actions) < limits)
+    if success is not None:
+        success = np.where(ended, success, np.nan)
     return Rollouts(np.stack(observations, 1), np.stack(actions, 1), lengths, diverged, success)

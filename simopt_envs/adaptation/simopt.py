@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import time
@@ -56,11 +57,12 @@ class SimOpt:
     measures again.
 
     Args:
-        env: id of a registered environment, or a :class:`Simulator`.
+        env_id: of a registered environment; or a :class:`Simulator`.
         distribution: p(ξ) to start from, over some of the simulator's parameters.
         trainer: trains the policy; None keeps the given one.
         real_system: what to adapt to.
-        policy: where the first training starts, or the fixed policy; None where recordings are replayed.
+        policy: where the first training starts, or the fixed policy, which recordings were then made with. Without
+            it, or with a trainer, their actions are replayed.
         discrepancy: the cost of ξ; without weights, those that the simulator states are used.
         update: how p(ξ) moves; REPS by default.
         simulated_rollouts: simulated episodes of one update; each ξ drawn takes ``real_rollouts`` of them.
@@ -73,14 +75,15 @@ class SimOpt:
         on_event: called when a phase begins and ends.
 
     Raises:
-        ValueError: for counts that are too small, parameters that the simulator does not have, weights that do not
-            fit the observation, or neither trainer nor policy.
+        ValueError: for counts that are too small, parameters that the simulator does not have, an environment whose
+            episodes cannot begin as measured ones did, weights that do not fit the observation, or neither trainer nor
+            policy.
         TypeError: for a directory with a trainer that cannot save and load policies.
     """
 
     def __init__(
         self,
-        env: str | Simulator,
+        env_id: str | Simulator,
         distribution: Gaussian,
         trainer: Trainer[Any] | None,
         real_system: RealSystem,
@@ -105,12 +108,15 @@ class SimOpt:
         ):
             if value < least:
                 raise ValueError(f"{name} must be at least {least}, got {value}")
-        if trainer is None and policy is None and getattr(real_system, "needs_policy", True):
+        needs_policy = getattr(real_system, "needs_policy", True)
+        if trainer is None and policy is None and needs_policy:
             raise ValueError(f"{type(real_system).__name__} needs a policy to run: give a trainer or a policy")
         if directory is not None and trainer is not None and not isinstance(trainer, PersistentTrainer):
             raise TypeError(f"{type(trainer).__name__} has no save and load, which checkpoints in a directory need")
-        self.simulator: Simulator = EnvSimulator(env) if isinstance(env, str) else env
+        self.simulator: Simulator = EnvSimulator(env_id) if isinstance(env_id, str) else env_id
         self.simulator.parameters.subset(distribution.space.names)  # raises for names that it does not have
+        if isinstance(self.simulator, EnvSimulator):
+            self.simulator.require_start()
         self.distribution = distribution
         self.trainer = trainer
         self.real_system = real_system
@@ -126,6 +132,7 @@ class SimOpt:
         self.seed = seed
         self.directory = None if directory is None else Path(directory)
         self._on_event = on_event or (lambda event: None)
+        self._replays = trainer is not None and not needs_policy  # recordings are not of a policy trained here
 
     def run(self, iterations: int, resume: bool = False) -> Iterator[Iteration]:
         """Yield iteration 0, before any adaptation, and so many further ones.
@@ -137,15 +144,22 @@ class SimOpt:
 
         Raises:
             FileExistsError: if the directory holds a run and ``resume`` is False.
-            ValueError: if it holds a run with other settings.
+            ValueError: if it holds a run with other settings, or with more iterations.
             RuntimeError: if every simulation of an update diverged.
         """
         if iterations < 0:
             raise ValueError(f"iterations must be >= 0, got {iterations}")
         checkpoint = Checkpoint(self.directory, self._settings(), resume)
-        return self._iterate(iterations, checkpoint)
+        finished = next(k for k in itertools.count() if not checkpoint.has(_name(k, "measure")))  # its last phase
+        if finished > iterations + 1:
+            raise ValueError(
+                f"{self.directory} holds a run of {finished - 1} iterations; resume it with as many or more, not with "
+                f"{iterations}"
+            )
+        return self._iterate(iterations, checkpoint, finished)
 
-    def _iterate(self, iterations: int, checkpoint: Checkpoint) -> Iterator[Iteration]:
+    def _iterate(self, iterations: int, checkpoint: Checkpoint, finished: int) -> Iterator[Iteration]:
+        """See :meth:`run`; so many of the iterations are on disk."""
         distribution, policy = self.distribution, self.policy
         measurement: _Measurement | None = None
         entries: list[dict[str, Any]] = []
@@ -189,7 +203,8 @@ class SimOpt:
                 real_rollouts=len(measurement.real),
             )
             entries.append(iteration.to_dict())
-            checkpoint.write_result(self._result(entries))
+            if len(entries) >= finished:  # so that no interruption leaves fewer on disk than there were
+                checkpoint.write_result(self._result(entries))
             yield iteration
 
     def _train(
@@ -312,13 +327,14 @@ class SimOpt:
         rng: np.random.Generator,
     ) -> tuple[Array, list[Trajectory], float | None]:
         """Costs of ξ that were drawn for an update of p(ξ), the episodes of the best, and the share of successes."""
-        rollouts = self.simulator.rollout(policy, distribution.space, xi, real, int(rng.integers(2**31)))
+        acting = None if self._replays else policy
+        rollouts = self.simulator.rollout(acting, distribution.space, xi, real, int(rng.integers(2**31)))
         costs = self.discrepancy(rollouts, real)
         if not np.isfinite(costs).any():
             raise RuntimeError(f"the simulation diverged for every one of {len(xi)} ξ drawn from\n{distribution}")
         best = int(np.argmin(costs))
         simulated = [rollouts.trajectory(best, i) for i in range(len(real))]
-        return costs, simulated, None if rollouts.success is None else float(rollouts.success.mean())
+        return costs, simulated, rollouts.success_rate()
 
     def _phase(
         self,

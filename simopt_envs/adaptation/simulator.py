@@ -6,10 +6,12 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from threading import Lock
 from typing import Any, Literal, Protocol
 
 import gymnasium as gym
 import numpy as np
+from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrapper
 from numpy.typing import NDArray
@@ -58,7 +60,8 @@ class Simulator(Protocol):
             seed: the j-th episode is seeded alike for all ξ (common random numbers).
 
         Returns:
-            Rollouts with leading axes (n, r).
+            Rollouts with leading axes (n, r). ``success`` is unknown of simulations that go on for longer than the
+            measured episodes.
         """
         ...
 
@@ -80,8 +83,8 @@ class EnvSimulator:
             at once.
 
     Raises:
-        ValueError: for an environment without ``parameters``, or without a vector environment of its own where that
-            is asked for.
+        ValueError: for an environment without ``parameters``, one whose observation is no Box with one axis, or one
+            without a vector environment of its own where that is asked for.
     """
 
     def __init__(
@@ -114,6 +117,8 @@ class EnvSimulator:
         self._options = options
         self._fall_back = vectorization_mode is None and not options
         self._worlds: VectorEnv | None = None
+        self._in_use = Lock()
+        self._starts_as_told = False
 
         single = self._make_env()
         try:
@@ -121,12 +126,18 @@ class EnvSimulator:
             if not isinstance(space, ParameterSpace):
                 raise ValueError(
                     f"{self.env_id} has no attribute 'parameters' (a ParameterSpace): "
-                    "make it one of RandomizablePhysics, from wrappers"
+                    "make it with AdaptableEnv, from wrappers"
+                )
+            observed = single.observation_space
+            if not isinstance(observed, spaces.Box) or len(observed.shape) != 1:
+                raise ValueError(
+                    f"{self.env_id} must observe a Box with one axis, not {observed}: wrap it in FlattenObservation, "
+                    "or make it with AdaptableEnv, from wrappers, which flattens dictionaries"
                 )
             self.parameters: ParameterSpace = space
             self.discrepancy_weights: Array | None = _attribute(single, "discrepancy_weights")
-            channels = range(int(np.prod(single.observation_space.shape or ())))
-            names = _attribute(single, "observation_names") or [f"observation_{i}" for i in channels]
+            channels = [f"observation_{i}" for i in range(observed.shape[0])]
+            names = _attribute(single, "observation_names") or channels
             self.observation_names: tuple[str, ...] = tuple(names)
         finally:
             single.close()
@@ -144,18 +155,44 @@ class EnvSimulator:
         """A vector environment at nominal ξ but for ``reset(options={"parameters": (n, d)})``."""
         return _OnHost(self._open(num_envs, AutoresetMode.NEXT_STEP))
 
+    def require_start(self) -> None:
+        """See that an episode can begin at a measured observation, as :meth:`rollout` needs it.
+
+        Raises:
+            ValueError: for single environments that ignore ``options["initial_observation"]``.
+        """
+        if self._starts_as_told or self.vectorization_mode == "native":
+            return
+        env = self._make_env()
+        try:
+            shown, drawn = (np.array(env.reset(seed=seed)[0]) for seed in (0, 1))
+            begun, _ = env.reset(seed=1, options={"initial_observation": shown})
+        finally:
+            env.close()
+        # Not whether it begins there to the last digit: noise, or other physics, may be in the way of that.
+        if np.array_equal(begun, drawn) and not np.array_equal(shown, drawn):
+            raise ValueError(
+                f"{self.env_id} ignores options['initial_observation'], so its episodes cannot begin as measured ones "
+                "did: make it with AdaptableEnv, from wrappers"
+            )
+        self._starts_as_told = True
+
     def rollout(
         self, policy: Policy | None, space: ParameterSpace, xi: Array, real: Sequence[Trajectory], seed: int
     ) -> Rollouts:
-        """See :meth:`Simulator.rollout`."""
-        if policy is None:
-            raise ValueError("closed-loop rollouts need a policy")
-        n, r = len(xi), len(real)
+        """See :meth:`Simulator.rollout`. Where actions are replayed, simulations are as long as their recordings.
+
+        Raises:
+            ValueError: see :meth:`require_start`; for recorded actions that are not as many as the environment's.
+        """
+        self.require_start()
+        n, r, lengths = len(xi), len(real), [len(trajectory) for trajectory in real]
         episodes = _Episodes(
             self.parameters.values(dict(zip(space.names, np.transpose(xi), strict=True)), n).repeat(r, axis=0),
             np.tile([trajectory.observations[0] for trajectory in real], (n, 1)),
             np.tile(np.random.SeedSequence(seed).generate_state(r) // 2, n),
-            max(map(len, real)),
+            np.tile(lengths, n) if policy is None else np.full(n * r, max(lengths)),
+            None if policy is not None else np.tile([_held(t.actions, max(lengths)) for t in real], (n, 1, 1)),
         )
         parts = -(-n * r // self.num_envs)  # whatever the engine, as the results are to be
         size = -(-n * r // parts)
@@ -163,7 +200,7 @@ class EnvSimulator:
         rollouts = self._roll_out(policy, [episodes.select(chosen) for chosen in rows])
         return Rollouts.concatenate(rollouts).map(lambda x: x[: n * r].reshape(n, r, *x.shape[1:]))
 
-    def _roll_out(self, policy: Policy, parts: list[_Episodes]) -> list[Rollouts]:
+    def _roll_out(self, policy: Policy | None, parts: list[_Episodes]) -> list[Rollouts]:
         """Rollouts of each part. Episodes that cannot be run, say as they crash their worker, count as diverged."""
         try:
             return self.engine.map(_roll_out, parts, (self, policy))
@@ -175,7 +212,7 @@ class EnvSimulator:
                 error.results[i] = self._one_by_one(policy, parts[i], finished.map(lambda x: x[:1]))
             return error.results
 
-    def _one_by_one(self, policy: Policy, episodes: _Episodes, like: Rollouts) -> Rollouts:
+    def _one_by_one(self, policy: Policy | None, episodes: _Episodes, like: Rollouts) -> Rollouts:
         """Rollouts of episodes among which some cannot be run."""
         each = [episodes.select(np.array([i])) for i in range(len(episodes.seeds))]
         try:
@@ -193,23 +230,34 @@ class EnvSimulator:
         return Rollouts.concatenate(rollouts)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without what belongs to this process: open worlds, and the engine."""
-        return self.__dict__ | {"_worlds": None, "engine": None}
+        """Without what belongs to this process: open worlds, who uses them, and the engine."""
+        return self.__dict__ | {"_worlds": None, "_in_use": None, "engine": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__ = state | {"_in_use": Lock()}
 
     def close(self) -> None:
         """Close the worlds that were kept for the next rollout."""
-        if self._worlds is not None:
-            self._worlds.close()
-            self._worlds = None
+        worlds, self._worlds = self._worlds, None
+        if worlds is not None:
+            worlds.close()
 
-    def run(self, policy: Policy, episodes: _Episodes) -> Rollouts:
-        """Run episodes side by side, in worlds that are kept for the next ones."""
-        size = len(episodes.seeds)
-        if self._worlds is None or self._worlds.num_envs != size:
-            self.close()
-            self._worlds = _OnHost(self._open(size, AutoresetMode.NEXT_STEP, num_threads=self._num_threads))
-        options = {"parameters": episodes.xi, "initial_observation": episodes.starts}
-        return run_episodes(self._worlds, policy, episodes.steps, seed=episodes.seeds.tolist(), options=options)
+    def run(self, policy: Policy | None, episodes: _Episodes) -> Rollouts:
+        """Run episodes side by side, in worlds that are kept for the next ones; of several threads, one at a time."""
+        with self._in_use:
+            size = len(episodes.seeds)
+            if self._worlds is None or self._worlds.num_envs != size:
+                self.close()
+                self._worlds = _OnHost(self._open(size, AutoresetMode.NEXT_STEP, num_threads=self._num_threads))
+            if policy is None:
+                assert episodes.actions is not None
+                policy = _Replay(episodes.actions, self._worlds.single_action_space)
+            options = {"parameters": episodes.xi, "initial_observation": episodes.starts}
+            try:
+                return run_episodes(self._worlds, policy, episodes.steps, seed=episodes.seeds.tolist(), options=options)
+            except Exception:
+                self.close()  # one of the worlds may be gone
+                raise
 
     def _open(
         self,
@@ -241,18 +289,43 @@ class EnvSimulator:
 
 @dataclass(frozen=True)
 class _Episodes:
-    """k episodes to run side by side, each with its ξ (k, d), first observation (k, o) and seed (k,)."""
+    """k episodes to run side by side.
+
+    Each has its ξ (k, d), first observation (k, o), seed (k,) and most steps (k,), and where no policy acts its actions
+    (k, T, a).
+    """
 
     xi: Array
     starts: Array
     seeds: NDArray[np.unsignedinteger]
-    steps: int
+    steps: NDArray[np.int64]
+    actions: Array | None
 
     def select(self, rows: NDArray[np.intp]) -> _Episodes:
-        return _Episodes(self.xi[rows], self.starts[rows], self.seeds[rows], self.steps)
+        actions = None if self.actions is None else self.actions[rows]
+        return _Episodes(self.xi[rows], self.starts[rows], self.seeds[rows], self.steps[rows], actions)
 
 
-def _roll_out(episodes: _Episodes, simulator: EnvSimulator, policy: Policy) -> Rollouts:
+class _Replay:
+    """A policy that repeats the actions (k, T, a) of k episodes, one step after the other, whatever it sees."""
+
+    def __init__(self, actions: Array, space: spaces.Space):
+        if actions.shape[2] != np.prod(space.shape or ()):
+            raise ValueError(f"the recordings have {actions.shape[2]} actions, but the environment takes {space}")
+        whole = np.issubdtype(space.dtype, np.integer)
+        self._actions = iter(actions.astype(space.dtype if whole else np.float64).swapaxes(0, 1))
+        self._shape = (len(actions), *(space.shape or ()))
+
+    def act(self, observations: Array) -> np.ndarray:
+        return next(self._actions).reshape(self._shape)
+
+
+def _held(actions: Array, steps: int) -> Array:
+    """Actions (T, a) of so many steps; the last one is held."""
+    return actions[np.minimum(np.arange(steps), len(actions) - 1)]
+
+
+def _roll_out(episodes: _Episodes, simulator: EnvSimulator, policy: Policy | None) -> Rollouts:
     return simulator.run(policy, episodes)
 
 

@@ -13,6 +13,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import VectorEnv
 from numpy.typing import ArrayLike
 
+from simopt_envs.adaptation.checkpoint import digest
 from simopt_envs.adaptation.protocols import Policy
 from simopt_envs.adaptation.rollouts import Rollouts, run_episodes
 from simopt_envs.adaptation.simulator import EnvSimulator, VectorizationMode
@@ -31,8 +32,9 @@ class HiddenSystem:
         noise: standard deviation of the sensor noise, in each channel's unit: a number for all channels, one per
             channel, or by name; a name may be a pattern such as ``"handle_*"``.
         dropout: probability that a channel is not measured at a step, in the same forms. Channels of equal
-            probability drop out together, as a tracker loses all coordinates of an object. The policy then goes on
-            seeing the last value, and the trajectory holds NaN. The first observation is always measured.
+            probability drop out together, as a tracker loses all coordinates of an object, and independently of the
+            others. The policy then goes on seeing the last value, and the trajectory holds NaN. The first observation
+            is always measured.
         vectorization_mode: see :class:`EnvSimulator`.
 
     Raises:
@@ -56,19 +58,20 @@ class HiddenSystem:
         self.dropout = _per_channel("dropout", dropout, self.observation_names)
         if (self.dropout >= 1).any():
             raise ValueError(f"dropout must be a probability below 1, got {dropout}")
-        digest = hashlib.sha256(xi.tobytes()).hexdigest()
+        # Of effects, too, which are arguments of the environment.
+        hidden = digest(simulator.identity(), dict(zip(simulator.parameters.names, xi.tolist(), strict=True)))
 
         def make_worlds(n: int) -> tuple[VectorEnv, dict[str, Any]]:
             return simulator.make_worlds(n), {"parameters": np.tile(xi, (n, 1))}
 
         self._make_worlds = make_worlds
-        self._identity = {"env_id": simulator.env_id, "parameters_sha256": digest}
+        self._identity = {"env_id": simulator.env_id, "parameters_sha256": hidden}
 
     def __repr__(self) -> str:
         return f"HiddenSystem({self._identity['env_id']!r}, parameters=<hidden>)"
 
     def identity(self) -> dict[str, Any]:
-        """What identifies it in a checkpoint: of ξ a digest."""
+        """What identifies it in a checkpoint: of the environment's arguments and ξ a digest."""
         return {**self._identity, "noise": self.noise.tolist(), "dropout": self.dropout.tolist()}
 
     def rollout(self, policy: Policy, n: int, rng: np.random.Generator) -> list[Trajectory]:
@@ -79,17 +82,18 @@ class HiddenSystem:
     def evaluate(self, policy: Policy, episodes: int, rng: np.random.Generator) -> float | None:
         """The share of so many episodes that end in success; None where the environment reports no ``is_success``."""
         sizes = [min(self._MOST_WORLDS, episodes - start) for start in range(0, episodes, self._MOST_WORLDS)]
-        success = Rollouts.concatenate([self._run(policy, size, rng) for size in sizes]).success
-        return None if success is None else float(success.mean())
+        return Rollouts.concatenate([self._run(policy, size, rng) for size in sizes]).success_rate()
 
     def _run(self, policy: Policy, n: int, rng: np.random.Generator) -> Rollouts:
         env, options = self._make_worlds(n)
         seeds = rng.integers(2**31, size=n).tolist()
         first = True
+        distinct = np.unique(self.dropout[self.dropout > 0])
+        group = np.searchsorted(distinct, self.dropout)  # of those that drop out together; where none does, any
 
         def measure(observation: Array) -> Array:
             nonlocal first
-            lost = rng.random((n, 1)) < self.dropout
+            lost = rng.random((n, max(len(distinct), 1)))[:, group] < self.dropout
             measured = observation + self.noise * rng.standard_normal(observation.shape)
             measured = measured if first else np.where(lost, np.nan, measured)
             first = False
@@ -103,6 +107,9 @@ class HiddenSystem:
 
 class RecordedSystem:
     """Episodes that were measured before, whatever policy asks for them.
+
+    Simulations replay their actions, also where a policy is trained under the p(ξ) that they lead to; the policy that
+    they were measured with acts in the simulations where SimOpt is given it, and no trainer.
 
     Args:
         trajectories: the recorded episodes, or windows of a long recording.

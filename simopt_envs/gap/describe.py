@@ -19,7 +19,7 @@ from simopt_envs.gap.carriers import Carrier, Residual, forces, readings
 from simopt_envs.gap.circumstances import Circumstances, circumstances
 from simopt_envs.gap.curves import Curve, Regression, Variable, regress
 from simopt_envs.gap.hypothesis import Hypothesis
-from simopt_envs.gap.localise import EVERYWHERE, Row, partitions, tabulate
+from simopt_envs.gap.localise import EVERYWHERE, Row, partitions, split_regime, tabulate
 from simopt_envs.physics.effects.joints import force_unit, is_slide
 from simopt_envs.physics.parameters import Array
 
@@ -144,7 +144,7 @@ def _where(rows: Sequence[Row]) -> str:
     row = max(regimes, key=lambda row: row.telling, default=None)
     if row is None or not row.telling:
         return ""
-    partition, part = row.regime.split(": ")
+    partition, part = split_regime(row.regime)
     return (
         f" Most is left of {row.channel} with the {partition} {part}: there its mean square is {row.lift:.1f} times"
         f" that of all its samples, {row.z:.0f} standard errors above noise."

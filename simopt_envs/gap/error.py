@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from simopt_envs.gap.hypothesis import Hypothesis
 from simopt_envs.gap.thresholds import MOVING, WINDOW
@@ -52,11 +53,12 @@ def held_out_errors(
         models: as given, refitted, repaired.
         noise: standard deviation of each channel's noise, (c,).
         rng: for the bootstrap.
+
+    Raises:
+        ValueError: where no channel shows more than noise.
     """
     scale = windows.channel_scale()
-    moving = scale > MOVING * noise  # a channel that shows noise alone says nothing
-    if not moving.any():
-        raise ValueError(f"nothing moves in the recordings held out: {', '.join(windows.names)} show noise alone")
+    moving = moving_channels(windows.names, scale, noise)
     names, parts = np.array(windows.recording), 1
     groups = [np.flatnonzero(names == name) for name in dict.fromkeys(windows.recording)]
     if len(groups) == 1:  # half seconds stand for recordings
@@ -90,6 +92,23 @@ def held_out_errors(
         intervals=tuple((float(a), float(b)) for a, b in zip(low, high, strict=True)),
         simulated=(simulated[0], simulated[1], simulated[2]),
     )
+
+
+def moving_channels(names: Sequence[str], scale: Array, noise: Array) -> NDArray[np.bool_]:
+    """Which channels of held-out recordings show more than noise, (c,): one that does not says nothing.
+
+    Args:
+        names: of the channels, c.
+        scale: standard deviation of each, (c,).
+        noise: standard deviation of each one's noise, (c,).
+
+    Raises:
+        ValueError: where none does.
+    """
+    moving = scale > MOVING * noise
+    if not moving.any():
+        raise ValueError(f"nothing moves in the recordings held out: {', '.join(names)} show noise alone")
+    return moving
 
 
 def _mean(squares: Array) -> Array:

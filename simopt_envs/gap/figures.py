@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import StrMethodFormatter
 
 from simopt_envs.gap.curves import Curve
-from simopt_envs.gap.localise import EVERYWHERE, SIGNIFICANT, Row
+from simopt_envs.gap.localise import EVERYWHERE, SIGNIFICANT, Row, split_regime
 from simopt_envs.gap.thresholds import MOVING
 from simopt_envs.measured.windows import Windows
 from simopt_envs.physics.parameters import Array
@@ -63,7 +63,7 @@ def _draw_cells(figure: Figure, axis: Axes, rows: Sequence[Row], channels: list[
         if np.isfinite(value):
             colour = "white" if abs(np.log(value)) > np.log(2.2) else INK
             axis.text(j, i, f"{value:.1f}", ha="center", va="center", fontsize=6.5, color=colour)
-    names, parts = zip(*(regime.split(": ") for regime in regimes), strict=True)
+    names, parts = zip(*map(split_regime, regimes), strict=True)
     axis.set_xticks(range(len(regimes)), parts, rotation=90)
     edges = [i for i in range(len(names)) if i == 0 or names[i] != names[i - 1]]
     for start, end in zip(edges, [*edges[1:], len(names)], strict=True):
@@ -226,7 +226,7 @@ def _telling_regimes(rows: Sequence[Row]) -> list[str]:
     for row in rows:
         if row.regime == EVERYWHERE:
             continue
-        partition = row.regime.split(": ")[0]
+        partition, _ = split_regime(row.regime)
         parts.setdefault(partition, [])
         if row.regime not in parts[partition]:
             parts[partition].append(row.regime)
@@ -238,8 +238,8 @@ def _telling_regimes(rows: Sequence[Row]) -> list[str]:
 def _natural(regime: str) -> int:
     """Low before middle before high."""
     order = ("hold", "free", "smooth", "steady", "away", "early", "low", "middle", "high", "late")
-    name = regime.split(": ")[1]
-    return order.index(name) if name in order else len(order)
+    _, part = split_regime(regime)
+    return order.index(part) if part in order else len(order)
 
 
 def _neighbours(windows: Windows, worst: int) -> list[int]:

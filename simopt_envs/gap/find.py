@@ -8,14 +8,17 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import gymnasium as gym
 import mujoco
 import numpy as np
 
 from simopt_envs.distributions.gaussian import Gaussian
+from simopt_envs.distributions.parameter_file import read_parameters
 from simopt_envs.engine import Engine
 from simopt_envs.gap.carriers import Residual
 from simopt_envs.gap.describe import describe
-from simopt_envs.gap.error import held_out_errors
+from simopt_envs.gap.environments import HOME, model_of
+from simopt_envs.gap.error import held_out_errors, moving_channels
 from simopt_envs.gap.explanation import Explanation
 from simopt_envs.gap.fit import Misfit
 from simopt_envs.gap.hypothesis import Candidate, Hypothesis
@@ -73,6 +76,7 @@ def find_gap(
     recordings: Sequence[str | Path | Recording],
     *,
     plain: Gaussian | None = None,
+    config: str | Path | None = None,
     mapping: LogMapping | str | Path | None = None,
     keyframe: str | None = None,
     effects: Sequence[Effect] = tuple(EFFECTS.values()),
@@ -83,25 +87,29 @@ def find_gap(
     """Find where a model and recordings disagree, and which physical effect is missing.
 
     Args:
-        model: an MJCF file, or a spec.
+        model: an MJCF file, a spec, or the id of an environment, of this package or one that runs an MJCF file.
         recordings: of the real system: files or what was read from them.
         plain: p(ξ) of the plain parameters before the data: what a refit may move before anything is called
-            missing. None for those of a good data sheet, see :func:`~simopt_envs.gap.plain.plain_parameters`.
+            missing. None for those of a good data sheet, see :func:`~simopt_envs.gap.plain.plain_parameters`, or of an
+            environment of this package for the first p(ξ) of ``adapt``.
+        config: a YAML file of it instead, see :func:`~simopt_envs.distributions.parameter_file.read_parameters`.
         mapping: names the columns of foreign logs.
-        keyframe: where joints without a column start.
+        keyframe: where joints without a column start; by default the model's reference, of an environment of this
+            package where its episodes begin.
         effects: the library to search.
         progress: is told of what is being done.
         engine: fits the candidates; threads of this process by default. The result does not depend on it.
         directory: keeps finished fits, from which a call with the same arguments goes on; None for none.
 
     Raises:
-        FileNotFoundError: for a file that does not exist.
+        FileNotFoundError: for a file that does not exist, or an environment that is not registered.
         FailedTasksError: naming the candidate, where a fit fails.
         ImportError: where MuJoCo is older than 4.0.
         ValueError: for a model that does not compile, recordings that do not fit it, audits that found errors,
-            effects none of which can act in the model, or a directory that keeps fits of something else.
+            effects none of which can act in the model, recordings of which those held out show no motion, a directory
+            that keeps fits of something else, or a config beside plain.
     """
-    problem = read(model, recordings, plain, mapping, keyframe)
+    problem = read(model, recordings, plain, mapping, keyframe, config)
     return solve(problem, effects=effects, progress=progress, engine=engine, directory=directory)
 
 
@@ -111,10 +119,19 @@ def read(
     plain: Gaussian | None = None,
     mapping: LogMapping | str | Path | None = None,
     keyframe: str | None = None,
+    config: str | Path | None = None,
 ) -> Problem:
     """What :func:`find_gap` is given, read and checked."""
     require_mujoco()
     began = time.perf_counter()
+    if config is not None:
+        if plain is not None:
+            raise ValueError(f"give plain parameters as p(ξ) or by {config}, not both")
+        plain = read_parameters(Path(config))
+    if isinstance(model, str) and model in gym.registry:
+        model, first = model_of(model)
+        if first is not None:
+            plain, keyframe = first if plain is None else plain, keyframe or HOME
     given = _spec(model)
     start = plain_parameters(given) if plain is None else Plain.of(given, plain)
     logs = [
@@ -164,6 +181,9 @@ def solve(
             short = problem.in_short_windows()
         if short.data.fitted.names == problem.data.fitted.names:  # they show as much
             problem, null = short, refitted(short, progress)
+
+    held_out = problem.data.held_out
+    moving_channels(held_out.names, held_out.channel_scale(), null.sensor_noise)  # raises where nothing moves
 
     def searched(problem: Problem, null: Base, directory: str | Path | None) -> tuple[Search, Explanation]:
         given = problem.plain, problem.data, problem.motion, seen, progress, engine, directory, problem.longer, null
@@ -237,14 +257,14 @@ def _gap(problem: Problem, explanation: Explanation) -> Gap:
     fitted = [base.hypothesis.xi(base.fit.u[None])[0] for base in (null, final)]
     models = [(null.hypothesis, as_given), (null.hypothesis, fitted[0]), (final.hypothesis, fitted[1])]
     errors = held_out_errors(explanation.data.held_out, models, null.sensor_noise, np.random.default_rng(_SEED))
-    spec, diff = repair(explained, problem.given, fitted[1])
+    spec, columns, diff = repair(explained, problem.given, fitted[1])
     left_by_null = _left_by(null, short.held_out).errors
     rows = localise(short.held_out, left_by_null, null.hypothesis.plain.model, short.parts)
     residuals = [_left_by(final, windows) for windows in (short.fitted, short.held_out)]
     left = describe(final.hypothesis, final.fit.u, residuals)
     named = separate(named_effects(explained), explained, problem.keyframe)
     seconds = time.perf_counter() - problem.began
-    return Gap(verdict, named, errors, rows, left, explained, unforeseen, spec, diff, seconds)
+    return Gap(verdict, named, errors, rows, left, explained, unforeseen, spec, columns, diff, seconds)
 
 
 def _left_by(base: Base, windows: Windows) -> Residual:
@@ -261,7 +281,7 @@ def _spec(model: str | Path | mujoco.MjSpec) -> mujoco.MjSpec:
     elif Path(model).exists():
         spec = mujoco.MjSpec.from_file(str(model))
     else:
-        raise FileNotFoundError(f"there is no model {model}")
+        raise FileNotFoundError(f"there is no model {model}: no such file, and no environment of that id")
     compiled = spec.compile()
     for i, name in zip(commanded_actuators(compiled), actuator_names(compiled), strict=True):
         spec.actuators[i].name = spec.actuators[i].name or name  # a dead band's part is called as its drive there

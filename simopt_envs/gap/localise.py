@@ -21,7 +21,7 @@ SIGNIFICANT = 3.0
 """Standard errors from which a regime counts."""
 
 _AFTER = 0.1  # s after a reversal or a command's step that count as its regime
-_FEWEST_WINDOWS = 4  # that a regime is in, to say anything of it
+_FEWEST_WINDOWS = 4  # that a regime is in, to say anything of it beside the channel as a whole
 _LEAST_SHARE = 0.02  # of the samples, likewise
 _VARIANCE_OF_SQUARE = 2.0  # of a standard normal
 _NOISE_KNOWN_BY = 2 / 3.9  # samples' worth: second differences, which give the size of the noise, go together
@@ -57,6 +57,12 @@ class Partition:
 
     name: str
     parts: dict[str, Mask]
+
+
+def split_regime(regime: str) -> tuple[str, str]:
+    """The partition and the part of a regime; joints, which partitions are named after, may have ``": "`` in theirs."""
+    partition, _, part = regime.rpartition(": ")
+    return partition, part
 
 
 def localise(windows: Windows, errors: Array, model: mujoco.MjModel, parts: int = 1) -> tuple[Row, ...]:
@@ -117,9 +123,10 @@ def tabulate(
     rows = []
     for partition in partitions:
         parts = {name: counted & mask[..., None] for name, mask in partition.parts.items()}
-        parts = {name: mask for name, mask in parts.items() if _is_present(mask)}
-        if len(parts) < min(2, len(partition.parts)):
-            continue
+        if partition.name != EVERYWHERE:
+            parts = {name: mask for name, mask in parts.items() if _is_present(mask)}
+            if len(parts) < 2:
+                continue
         squares = {name: np.sum(errors**2, axis=(0, 1), where=mask) for name, mask in parts.items()}
         counts = {name: np.maximum(mask.sum(axis=(0, 1)), 1) for name, mask in parts.items()}
         of_channel = sum(squares.values()) / np.maximum(sum(counts.values()), 1)
@@ -140,8 +147,9 @@ def _z(errors: Array, mask: Mask, counted: Mask) -> Array:
 
     These are of the scatter over windows, since errors within one go together: at least what normal errors scatter that
     are independent, as a few windows may scatter less by chance; at most what those do that are all the same within a
-    window, as more is of the gap itself, which would hide where it shows in one of a few recordings. On top comes that
-    of the noise which the errors were whitened with: it was estimated from about as many samples as there are.
+    window, as more is of the gap itself, which would hide where it shows in one of a few recordings. Of hardly any
+    windows it is the most. On top comes that of the noise which the errors were whitened with: it was estimated from
+    about as many samples as there are.
     """
     count = mask.sum(axis=1)
     surplus = np.sum(errors**2 - 1.0, axis=1, where=mask)
@@ -150,7 +158,8 @@ def _z(errors: Array, mask: Mask, counted: Mask) -> Array:
     windows = np.count_nonzero(count, axis=0)
     scatter = np.sum((surplus - mean * count) ** 2, axis=0) * windows / np.maximum(windows - 1, 1)
     together = np.sum(count**2, axis=0)
-    scatter = np.clip(scatter, _VARIANCE_OF_SQUARE * total, _VARIANCE_OF_SQUARE * together)
+    least = np.where(windows < _FEWEST_WINDOWS, together, total)
+    scatter = np.clip(scatter, _VARIANCE_OF_SQUARE * least, _VARIANCE_OF_SQUARE * together)
     variance = scatter / np.maximum(total, 1) ** 2
     of_noise = _VARIANCE_OF_SQUARE / np.maximum(_NOISE_KNOWN_BY * counted.sum(axis=(0, 1)), 1)
     error = np.sqrt(variance + of_noise)

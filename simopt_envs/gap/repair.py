@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import difflib
+import json
 import os
+from collections.abc import Collection
 from pathlib import Path
 
 import mujoco
@@ -16,6 +18,8 @@ from simopt_envs.physics.effects.effect import object_name
 from simopt_envs.physics.parameters import Array, ParameterSpace
 from simopt_envs.physics.spec_writer import write_spec
 
+COLUMNS = "columns.yaml"
+"""File of what MJCF cannot hold, beside the repaired model."""
 _LINEAR = 1  # interpolation of MuJoCo's delays
 _DIGITS = 6  # that MuJoCo writes
 _CONTEXT = 1  # lines around a change
@@ -67,19 +71,25 @@ def to_xml_in(spec: mujoco.MjSpec, folder: Path) -> str:
     return str(spec.to_xml())
 
 
-def column_lines(hypothesis: Hypothesis, xi: Array) -> list[str]:
-    """What MJCF cannot hold of ξ, as lines of the observation model that a recordings' reader applies."""
-    lines = []
+def observation_model(hypothesis: Hypothesis, xi: Array, columns: Collection[str]) -> str:
+    """What MJCF cannot hold of ξ (d,): the mapping by which recordings' columns are read as the model means them.
+
+    Empty for nothing, else the YAML of a :class:`~simopt_envs.measured.mapping.LogMapping` with the key ``shown``.
+    """
+    shown: dict[str, dict[str, str]] = {}
     for parameter, value in zip(hypothesis.space, xi, strict=True):
-        for write in (w for w in parameter.writes if w.field.startswith("column.")):
-            lines.append(f"{write.object}: {{{write.field.removeprefix('column.')}: {value:.{_DIGITS}g}}}")
-    return lines
+        for write in (w for w in parameter.writes if w.field.startswith("column.") and w.object in columns):
+            shown.setdefault(str(write.object), {})[write.field.removeprefix("column.")] = f"{value:#.{_DIGITS}g}"
+    lines = [
+        f"  {json.dumps(column)}: {{{', '.join(f'{key}: {value}' for key, value in numbers.items())}}}"
+        for column, numbers in shown.items()
+    ]
+    return "\n".join(["shown:", *lines, ""]) if lines else ""
 
 
-def difference(given: mujoco.MjSpec, spec: mujoco.MjSpec, columns: list[str]) -> str:
-    """A unified diff of two specs as MuJoCo writes them, with the observation model after it."""
+def difference(given: mujoco.MjSpec, spec: mujoco.MjSpec, columns: str) -> str:
+    """A unified diff of two specs as MuJoCo writes them, with the observation model, if any, after it."""
     before, after = (s.to_xml().splitlines() for s in (given, spec))
     lines = list(difflib.unified_diff(before, after, "model.xml", "model.repaired.xml", n=_CONTEXT, lineterm=""))
-    if columns:
-        lines += ["--- /dev/null", "+++ columns.yaml", f"@@ -0,0 +1,{len(columns)} @@", *(f"+{c}" for c in columns)]
+    lines += difflib.unified_diff([], columns.splitlines(), "/dev/null", COLUMNS, lineterm="")
     return "\n".join(lines) + "\n"

@@ -83,12 +83,16 @@ def verdict(gap: Gap, description: Description | None) -> Section:
     """The verdict in one sentence, and the numbers that a reader looks for first."""
     errors = gap.errors
     removable = max(errors.refit - errors.noise_floor, 1e-12)
-    removed = np.clip((errors.refit - errors.after) / removable, 0, 1)
+    removed = f"{np.clip((errors.refit - errors.after) / removable, 0, 1):.0%}"
+    explains = f"That explains {removed} of the error that noise does not"
+    if removed == "100%":  # of an average in which the rest does not show
+        explains = (
+            f"With it, the mean square of the errors is {1 + gap.explanation.final.excess:.3g} times that of noise"
+        )
     names = " and ".join(str(named) for named in gap.effects)
     sentence = {
         "named": f"The model lacks {names}. With it, what is left on recordings that no fit saw is noise.",
-        "partly": f"The model lacks {names}. That explains {removed:.0%} of the error that noise does not; the rest "
-        "has another cause, or the law has another form.",
+        "partly": f"The model lacks {names}. {explains}; the rest has another cause, or the law has another form.",
         "none": "With its plain parameters refitted, the model predicts the recordings as well as their noise and "
         "what the fit leaves uncertain allow.",
         "unexplained": "The model lacks something that is not in the library of effects, or the recordings cannot "

@@ -18,7 +18,7 @@ from simopt_envs.gap.explanation import Explanation
 from simopt_envs.gap.hypothesis import Candidate
 from simopt_envs.gap.localise import Row
 from simopt_envs.gap.presence import is_there
-from simopt_envs.gap.repair import column_lines, difference, repaired, to_xml_in
+from simopt_envs.gap.repair import COLUMNS, difference, observation_model, repaired, to_xml_in
 from simopt_envs.gap.thresholds import CONFIDENT, EXPLAINED, LEAST_SHARE
 from simopt_envs.gap.timestep import TIMESTEP
 from simopt_envs.gap.trial import Data, of_median_window
@@ -79,6 +79,7 @@ class Gap:
         explanation: the search behind it.
         unforeseen: what the verdict is on, see :attr:`simopt_envs.gap.trial.Base.unforeseen`.
         spec: the repaired model.
+        columns: what of it MJCF cannot hold, as the mapping by which recordings are read for it; empty for nothing.
         diff: its difference to the model as given.
         seconds: that it took.
     """
@@ -91,6 +92,7 @@ class Gap:
     explanation: Explanation
     unforeseen: float
     spec: mujoco.MjSpec
+    columns: str
     diff: str
     seconds: float
 
@@ -181,7 +183,9 @@ class Gap:
     def save(self, folder: str | Path) -> Path:
         """Write ``gap.json``, ``model.repaired.xml``, ``model.diff`` and the report with its plots into a folder.
 
-        Commands of motions that tell effects from their partners go into its folder ``separate``, as CSV.
+        What of the repaired model MJCF cannot hold goes into ``columns.yaml`` there, if there is any: recordings read
+        with that mapping are as the model means them. Commands of motions that tell effects from their partners go into
+        the folder ``separate``, as CSV.
 
         Raises:
             ImportError: without what the report needs, after all else is written.
@@ -190,6 +194,8 @@ class Gap:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "model.repaired.xml").write_text(to_xml_in(self.spec, folder))
         (folder / "model.diff").write_text(self.diff)
+        if self.columns:
+            (folder / COLUMNS).write_text(self.columns)
         (folder / "gap.json").write_text(json.dumps(self.to_dict(), indent=1))
         for effect in self.effects:
             for partner in effect.partners:
@@ -280,8 +286,9 @@ def two_directions(model: mujoco.MjModel, named: Sequence[Named]) -> Iterator[st
             )
 
 
-def repair(explanation: Explanation, given: mujoco.MjSpec, xi: Array) -> tuple[mujoco.MjSpec, str]:
-    """The repaired spec and its difference to the one given."""
+def repair(explanation: Explanation, given: mujoco.MjSpec, xi: Array) -> tuple[mujoco.MjSpec, str, str]:
+    """The repaired spec, what of it MJCF cannot hold, and the difference of both to the one given."""
     hypothesis = explanation.final.hypothesis
+    columns = observation_model(hypothesis, xi, explanation.data.fitted_recordings[0].columns)
     spec = repaired(hypothesis, xi)
-    return spec, difference(given, spec, column_lines(hypothesis, xi))
+    return spec, columns, difference(given, spec, columns)

@@ -21,7 +21,7 @@ from simopt_envs.measured.smoothing import smooth
 
 JITTER = 0.1  # an interval that differs from the median by more than this share of it is jittered ...
 JITTERED_SHARE = 0.01  # ... worth a word where more than this share of them is
-PLAUSIBLE_RATES = (2.0, 50_000.0)  # [Hz]: outside it time is hardly in seconds
+PLAUSIBLE_RATES = (2.0, 50_000.0)  # [Hz]: outside it time is hardly in seconds, and no motion in the samples
 LARGEST = 1e9  # of any channel
 MISSING_SHARE = 0.5  # of a channel: with more samples missing it cannot be interpolated
 CLIPPED_SAMPLES = 5  # consecutive samples exactly at an extreme value, which a moving signal does not show ...
@@ -101,7 +101,7 @@ def _time(recording: Recording) -> Iterator[Finding]:
             " used",
         )
     if not PLAUSIBLE_RATES[0] <= 1 / period <= PLAUSIBLE_RATES[1]:
-        yield Finding.warning("time", "units", f"the rate is {1 / period:g} Hz: is time in seconds?")
+        yield Finding.error("time", "units", f"the rate is {1 / period:g} Hz: is time in seconds?")
     off = np.abs(intervals / period - 1)
     gaps, row = intervals > GAP_PERIODS * period, int(np.argmax(intervals))
     if recording.is_all_but_gap:

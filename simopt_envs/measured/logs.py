@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 
 from simopt_envs.measured.audit import audit, audited
+from simopt_envs.measured.channels import model_channels
 from simopt_envs.measured.mapping import LogMapping
 from simopt_envs.measured.plots import plot_error, plot_recording, plot_replay
 from simopt_envs.measured.readers import load_recordings
@@ -88,8 +89,10 @@ def inspect_log(
         folder = Path(out)
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "findings.txt").write_text(f"{inspection}\n")
+        known = {} if compiled is None else model_channels(compiled)
+        units = {name: channel.unit for name, channel in known.items()}
         for recording in inspection.recordings:
-            plot_recording(recording, folder / f"{recording.name}.png", inspection.findings[recording.name])
+            plot_recording(recording, folder / f"{recording.name}.png", inspection.findings[recording.name], units)
     return inspection
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,8 +19,20 @@ _ROW = 1.6  # inches per channel
 _WIDTH = 10.0
 
 
-def plot_recording(recording: Recording, path: str | Path, findings: Sequence[Finding] = ()) -> Path:
-    """Draw every column over time, those with findings in red, and the intervals between the time stamps."""
+def plot_recording(
+    recording: Recording,
+    path: str | Path,
+    findings: Sequence[Finding] = (),
+    units: Mapping[str, str] = MappingProxyType({}),
+) -> Path:
+    """Draw every column over time, those with findings in red, and the intervals between the time stamps.
+
+    Args:
+        recording: to draw.
+        path: of the image.
+        findings: of its audit.
+        units: of columns, where they are known.
+    """
     names = list(recording.columns)
     figure, axes = _rows(len(names) + 1)
     flagged = {finding.channel for finding in findings}
@@ -31,7 +44,7 @@ def plot_recording(recording: Recording, path: str | Path, findings: Sequence[Fi
             linewidth=0.8,
             drawstyle="steps-post" if name.startswith("ctrl/") else "default",
         )
-        axis.set_ylabel(name, fontsize=8)
+        axis.set_ylabel(f"{name}\n[{units[name] or '1'}]" if name in units else name, fontsize=8)
     axes[-1].plot(recording.time[1:], 1e3 * np.diff(recording.time), ".", markersize=2, color="tab:gray")
     axes[-1].set_ylabel("interval [ms]", fontsize=8)
     axes[-1].set_xlabel("time [s]")
@@ -93,5 +106,7 @@ def _rows(count: int) -> tuple[Figure, list]:
 def _save(figure: Figure, path: str | Path) -> Path:
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
+    for text in figure.findobj(lambda artist: hasattr(artist, "set_parse_math")):
+        text.set_parse_math(False)  # type: ignore[attr-defined]  # names may hold dollars
     figure.savefig(path, dpi=120)
     return path

@@ -5,15 +5,15 @@ from __future__ import annotations
 import csv
 import json
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from simopt_envs.measured.mapping import LogMapping
+from simopt_envs.measured.mapping import LogMapping, Source
 from simopt_envs.measured.recording import Finding, Recording
 from simopt_envs.measured.resample import Array
 
@@ -23,11 +23,19 @@ _LEROBOT_INDICES = ("frame_index", "episode_index", "index", "task_index")
 
 @dataclass(frozen=True)
 class _Table:
-    """A log as it is: named columns and what was wrong with reading them."""
+    """A log as it is.
+
+    Attributes:
+        name: of the log.
+        columns: name -> numbers, (T,).
+        warnings: what was wrong with reading them.
+        words: name -> first cell or type, of columns that hold no numbers: a mode, a comment, a date.
+    """
 
     name: str
     columns: Mapping[str, Array]
     warnings: tuple[Finding, ...] = ()
+    words: Mapping[str, str] = field(default_factory=dict)
 
 
 def load_recording(
@@ -68,6 +76,11 @@ def load_recordings(path: str | Path, mapping: LogMapping | str | Path | None = 
 
 def _recording(table: _Table, mapping: LogMapping | None) -> Recording:
     warnings = table.warnings
+    sources = [Source("time")] if mapping is None else [mapping.time, *(mapping.columns or {}).values()]
+    for source in sources:
+        if source is not None and source.column in table.words:
+            first = table.words[source.column]
+            raise ValueError(f"{table.name}: column {source.column!r} holds no numbers ({first} ...)")
     if mapping is not None:
         time, columns = mapping.apply(table.columns)
     else:
@@ -111,30 +124,37 @@ def _tables(path: str | Path, mapping: LogMapping | None) -> Iterator[_Table]:
         else:
             raise ValueError(f"{path} is neither a LeRobot (meta/info.json) nor a Minari (data/metadata.json) data set")
         return
-    if path.suffix not in _READERS:
+    suffix = path.suffix.lower()
+    if suffix not in _READERS:
         raise ValueError(f"{path.name}: unknown kind of recording; known are {', '.join(_READERS)}")
     if path.stat().st_size == 0:
         raise ValueError(f"{path.name}: the file is empty")
-    yield from _READERS[path.suffix](path, mapping)
+    yield from _READERS[suffix](path, mapping)
 
 
 def _text(path: Path, mapping: LogMapping | None) -> Iterator[_Table]:
-    """Text with one row a line, separated by commas, semicolons, tabs or blanks."""
+    """Text with one row a line, separated by commas, semicolons, tabs or blanks; decimal commas where commas do not."""
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except UnicodeDecodeError:
-        raise ValueError(f"{path.name} is not text") from None
+        raise ValueError(f"{path.name} is not UTF-8 text") from None
     lines = "\n".join(lines[mapping.header_lines if mapping else 0 :]).strip().splitlines()
     if not lines:
         raise ValueError(f"{path.name}: the file holds no line of data")
-    delimiter = next((d for d in ",;\t" if d in lines[0]), None)
-    rows = list(csv.reader(lines, delimiter=delimiter)) if delimiter else [line.split() for line in lines]
+    delimiter = _delimiter(lines[0], len(mapping.column_names or ()) if mapping else 0)
+    if delimiter:
+        rows = list(csv.reader(lines, delimiter=delimiter, skipinitialspace=True))
+    else:
+        rows = [line.split() for line in lines]
     if mapping and mapping.column_names:
         names = list(mapping.column_names)
-    elif any(np.isnan(_number(cell)) for cell in rows[0]):
+    elif np.isnan(_numbers(rows[0], delimiter)).any():
         names = [cell.strip() for cell in rows.pop(0)]
     else:
         raise ValueError(f"{path.name} has no line of column names; give column_names in a mapping")
+    if not rows:
+        raise ValueError(f"{path.name} holds no row of data")
+    names, rows = _without_empty_end(names, rows)
     if twice := [name for name, count in Counter(names).items() if count > 1]:
         raise ValueError(f"{path.name}: column {twice[0]!r} appears more than once")
     warnings = []
@@ -151,17 +171,46 @@ def _text(path: Path, mapping: LogMapping | None) -> Iterator[_Table]:
             f" {len(names)} values; the first is data row {broken[0] + 1}"
         )
         warnings.append(Finding.warning("", "rows", message))
-    columns = {}
+    columns, words = {}, {}
     for name, cells in zip(names, zip(*rows, strict=True), strict=True):
-        values = np.array([_number(cell) for cell in cells])
-        words = [cell for cell, value in zip(cells, values, strict=True) if np.isnan(value) and _is_word(cell)]
-        if words and np.isnan(values).all():
-            continue  # a column of text: a mode, a comment
-        if words:
-            message = f"{len(words)} cells are no numbers and read as missing, the first is {words[0]!r}"
+        values = _numbers(cells, delimiter)
+        text = [cell for cell, value in zip(cells, values, strict=True) if np.isnan(value) and _is_word(cell)]
+        if text and np.isnan(values).all():
+            words[name] = repr(text[0])
+            continue
+        if text:
+            message = f"{len(text)} cells are no numbers and read as missing, the first is {text[0]!r}"
             warnings.append(Finding.warning(name, "cells", message))
         columns[name] = values
-    yield _Table(path.stem, columns, tuple(warnings))
+    yield _Table(path.stem, columns, tuple(warnings), words)
+
+
+def _delimiter(line: str, columns: int) -> str | None:
+    """What separates the cells of the first line, None for blanks.
+
+    Of comma, semicolon and tab it is the one that gives as many columns as there are, where that is known (else 0), or
+    the most.
+    """
+    found = max(",;\t", key=lambda mark: (line.count(mark) + 1 == columns, line.count(mark)))
+    return found if found in line else None
+
+
+def _without_empty_end(names: list[str], rows: list[list[str]]) -> tuple[list[str], list[list[str]]]:
+    """Without nameless last columns that hold nothing, as of lines that all end in commas."""
+    width = len(names)
+    while names and not names[-1] and not any(row[len(names) - 1] for row in rows if len(row) == width):
+        names = names[:-1]
+    return names, [row[: len(names)] if len(row) == width else row for row in rows]
+
+
+def _numbers(cells: Sequence[str], delimiter: str | None) -> Array:
+    """The numbers in some cells, NaN where there is none.
+
+    Commas are decimal where they separate no columns, unless a cell has a point: then they may group thousands.
+    """
+    if delimiter != "," and not any("." in cell for cell in cells):
+        cells = [cell.replace(",", ".") for cell in cells]
+    return np.array([_number(cell) for cell in cells])
 
 
 def _number(cell: str) -> float:
@@ -176,9 +225,15 @@ def _is_word(cell: str) -> bool:
 
 
 def _npz(path: Path, mapping: LogMapping | None) -> Iterator[_Table]:
+    arrays = {}
     with _decoding(path), np.load(path, allow_pickle=False) as archive:
-        arrays = {name: archive[name] for name in archive.files}
-    yield _Table(path.stem, _flatten(arrays))
+        for name in archive.files:
+            with _decoding(f"array {name!r}"):
+                arrays[name] = archive[name]
+    words = {
+        name: repr(str(array.flat[0])) for name, array in arrays.items() if array.size and array.dtype.kind in "MSU"
+    }
+    yield _Table(path.stem, _flatten(arrays), words=words)
 
 
 def _mat(path: Path, mapping: LogMapping | None) -> Iterator[_Table]:
@@ -203,10 +258,11 @@ def _parquet(path: Path, mapping: LogMapping | None) -> Iterator[_Table]:
     with _decoding(path):
         table = parquet.read_table(path)
         arrays = {name: _arrow_values(table[name]) for name in table.column_names}
+    words = {name: str(table[name].type) for name, values in arrays.items() if values is None}
     numeric = {name: values for name, values in arrays.items() if values is not None}
     episodes = numeric.get("episode_index")
     if episodes is None:
-        yield _Table(path.stem, _flatten(numeric))
+        yield _Table(path.stem, _flatten(numeric), words=words)
         return
     if "time" not in numeric and "timestamp" in numeric:
         numeric["time"] = numeric["timestamp"]  # its own name stays for a mapping
@@ -285,8 +341,8 @@ def _flatten(arrays: Mapping[str, np.ndarray], names: Mapping[str, list[str]] | 
     for name, array in arrays.items():
         if array.dtype.kind not in "fiub" or array.ndim == 0:
             continue
-        if array.ndim == 1:
-            columns[name] = array.astype(np.float64)
+        if array.ndim == 1 or (name == "time" and array.size == len(array)):
+            columns[name] = array.astype(np.float64).reshape(-1)
             continue
         flat = array.reshape(len(array), -1).astype(np.float64)
         entries = (names or {}).get(name, [])

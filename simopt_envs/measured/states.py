@@ -57,6 +57,8 @@ def reference_qpos(model: mujoco.MjModel, keyframe: str | None = None) -> Array:
         return model.qpos0.copy()
     key = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, keyframe)
     if key < 0:
+        if not model.nkey:
+            raise ValueError(f"unknown keyframe {keyframe!r}: the model has none")
         raise ValueError(unknown_name("keyframe", keyframe, [model.key(i).name for i in range(model.nkey)]))
     return model.key_qpos[key].copy()
 

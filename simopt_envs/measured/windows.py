@@ -123,7 +123,7 @@ def cut_windows(
 
     Raises:
         ValueError: if an actuator has no column, no column names anything in the model, recordings differ in their
-            columns, or no whole window fits.
+            columns, windows are too short to hold two samples, or no whole window fits.
     """
     recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
     if not recordings:
@@ -137,6 +137,9 @@ def cut_windows(
     period = stride * timestep
     grids = [recording.resample(period) for recording in recordings]
     samples = min(len(grid) for grid in grids) if seconds is None else round(seconds / period) + 1
+    if samples < 2:
+        length = min(recording.duration for recording in recordings) if seconds is None else seconds
+        raise ValueError(f"windows of {length:g} s hold no two samples that are {period:g} s apart")
     hop = samples if seconds is None else max(1, round((step or seconds) / period))
     past = max(_longest_history(model), int(np.ceil(history / timestep)) + 1)
     rounding = np.array([_rounding(recordings, channel.name) for channel in channels])

@@ -16,6 +16,7 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from matplotlib.ticker import MaxNLocator, PercentFormatter
 
 from simopt_envs.measured.trajectory import Trajectory
@@ -50,14 +51,21 @@ P = ParamSpec("P")
 
 
 def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
-    """Draw with the style of this package, whatever the user's matplotlib is set to."""
+    """Draw with the style of this package, whatever the user's matplotlib is set to, and names as they are."""
 
     @wraps(draw)
     def draw_styled(*args: P.args, **kwargs: P.kwargs) -> Figure:
         with rc_context(STYLE):
-            return draw(*args, **kwargs)
+            return without_formulas(draw(*args, **kwargs))
 
     return draw_styled
+
+
+def without_formulas(figure: Figure) -> Figure:
+    """The figure, its text with dollars shown as it is: that of a name, as matplotlib's own comes when it is drawn."""
+    for text in figure.findobj(lambda artist: isinstance(artist, Text) and "$" in artist.get_text()):
+        text.set_parse_math(False)  # type: ignore[attr-defined]
+    return figure
 
 
 def save_figure(figure: Figure, path: Path) -> Path:
@@ -148,7 +156,9 @@ def overlay_figure(run: Run) -> Figure:
                     axis.plot(time, trajectory.observations[:, channel], **style)
             _note_error(axis, real, simulated, channel)
             if column == 0:
-                axis.set_ylabel(run.channels[channel], rotation=0, ha="right", va="center")
+                name = run.channels[channel]
+                unit = run.details.channel_units.get(name)
+                axis.set_ylabel(f"{name}\n[{unit}]" if unit else name, rotation=0, ha="right", va="center")
         panels[0, column].set_title("Before adaptation" if iteration == 0 else f"After iteration {iteration}")
         panels[-1, column].set_xlabel("time [s]" if period else "control step")
     handles, labels = panels[0, 0].get_legend_handles_labels()

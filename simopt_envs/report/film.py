@@ -67,7 +67,9 @@ def film_policies(
     except ImportError:
         raise RuntimeError('a film needs imageio: pip install "simopt-envs[report]"') from None
     clips = [record_clip(env_id, policy, parameters, label, seed) for label, policy in policies.items()]
-    return [save_figure(strip_figure(clips), directory / STRIP), write_film(clips, directory / "film")]
+    moving = write_film(clips, directory / "film")
+    strip = save_figure(strip_figure(clips), directory / f".{STRIP}")
+    return [strip.replace(directory / STRIP), moving]  # last and at once: where there is a strip, all is there
 
 
 def record_clip(env_id: str, policy: Policy, parameters: Mapping[str, float], label: str, seed: int = 0) -> Clip:

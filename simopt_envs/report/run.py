@@ -33,6 +33,7 @@ class Details:
         truth: the hidden parameters that differ from nominal; None where nobody knows them, as on a robot.
         notes: sentences for the reader: warnings about the data, why there is no film.
         versions: of Python and the packages that computed the run.
+        channel_units: units of observed channels, by their names, where they are known.
     """
 
     command: str = ""
@@ -41,6 +42,7 @@ class Details:
     truth: Mapping[str, float] | None = None
     notes: tuple[str, ...] = ()
     versions: Mapping[str, str] = field(default_factory=lambda: installed_versions())
+    channel_units: Mapping[str, str] = field(default_factory=dict)
 
     def save(self, directory: Path) -> None:
         """Write them into the run's folder."""

@@ -9,7 +9,7 @@ from simopt_envs.physics.parameters import Array, Parameter, Write
 from simopt_envs.physics.simulation import Simulation
 
 JOINTS = tuple(f"joint{i}" for i in range(1, 8))
-_LONGEST_LATENCY = 0.04  # s, what the actuators' command buffers hold
+_LONGEST_LATENCY = 0.04  # s; the actuators' command buffers hold 44 (Panda) and 42 ms (YuMi)
 
 
 class VelocityArm:
@@ -19,8 +19,8 @@ class VelocityArm:
     servo's gain, on damping and on load, as it does on a compliant robot.
 
     Args:
-        model: has joints and position servos ``joint1`` ... ``joint7``, each servo with a command buffer of 40 ms, and
-            custom numbers ``action_scaling`` [rad/s], one per joint.
+        model: has joints and position servos ``joint1`` ... ``joint7``, each servo with a command buffer of at least
+            40 ms, and custom numbers ``action_scaling`` [rad/s], one per joint.
         dt: seconds between two actions.
     """
 

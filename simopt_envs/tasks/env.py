@@ -6,8 +6,9 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.utils import EzPickle
 
-from simopt_envs.physics.parameters import Array, ParameterSpace
+from simopt_envs.physics.parameters import Array, ParameterSpace, unknown_name
 from simopt_envs.physics.simulation import SingleSimulation
 from simopt_envs.tasks.options import episode_parameters, start_qpos
 from simopt_envs.tasks.task import Task
@@ -15,7 +16,7 @@ from simopt_envs.tasks.task import Task
 _FIRST_WORLD = np.zeros(1, dtype=np.intp)
 
 
-class TaskEnv(gym.Env[Array, Array]):
+class TaskEnv(gym.Env[Array, Array], EzPickle):
     """One world of a task.
 
     ``reset(options={"parameters": {name: value}})`` sets ξ for that episode, the rest nominal, and
@@ -23,17 +24,23 @@ class TaskEnv(gym.Env[Array, Array]):
     ``info["parameters"]`` of reset says what is in force, ``info["is_success"]`` of every step whether the task is
     solved.
 
+    A copy, pickled or deep, is a new environment of the same task: it wants a ``reset`` before its first step.
+
     Args:
         task: the task.
         render_mode: None, "rgb_array" or "human".
 
     Raises:
-        ValueError: by ``reset``, for an option or parameter it does not know or cannot take.
+        ValueError: for a render mode that there is not; by ``reset``, for an option or parameter it does not know or
+            cannot take; by ``step``, for an action that is not finite.
     """
 
     metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 1}  # noqa: RUF012 - Gymnasium's own attribute
 
     def __init__(self, task: Task, render_mode: str | None = None):
+        EzPickle.__init__(self, task, render_mode)
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ValueError(unknown_name("render mode", render_mode, self.metadata["render_modes"]))
         self.task = task
         self.simulation = SingleSimulation(task.make_model(), task.parameters)
         self.parameters: ParameterSpace = task.parameters
@@ -43,6 +50,7 @@ class TaskEnv(gym.Env[Array, Array]):
         self.metadata = self.metadata | {"render_fps": round(1 / self.dt)}
         self.render_mode = render_mode
         self._renderer: Any = None
+        self._observation = np.zeros(self.observation_space.shape)
 
     @property
     def model(self) -> Any:
@@ -69,18 +77,28 @@ class TaskEnv(gym.Env[Array, Array]):
         self.simulation.reset(_FIRST_WORLD, qpos[None], np.zeros((1, self.model.nv)), self.task.hold(qpos[None]))
         if self.render_mode == "human":
             self.render()
-        return self.task.observe(self.simulation)[0], {"parameters": self.parameters.as_dict(xi)}
+        self._observation = self.task.observe(self.simulation)[0]
+        return self._observation.copy(), {"parameters": self.parameters.as_dict(xi)}
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        """Advance by ``dt``. A world that diverged is truncated, with ``info["diverged"]`` True."""
-        actions = np.clip(np.asarray(action, dtype=np.float64), -1.0, 1.0)[None]
-        diverged = self.simulation.step(self.task.control(self.simulation, actions), self.task.substeps)
+        """Advance by ``dt``.
+
+        A world that diverged is truncated, its observation the last valid one, its reward 0, ``info["diverged"]`` True.
+        """
+        action = np.asarray(action, dtype=np.float64)
+        if not np.isfinite(action).all():
+            raise ValueError(f"the action is not finite: {action}")
+        actions = np.clip(action, -1.0, 1.0)[None]
+        diverged = bool(self.simulation.step(self.task.control(self.simulation, actions), self.task.substeps)[0])
         outcome = self.task.evaluate(self.simulation, actions)
         if self.render_mode == "human":
             self.render()
-        info: dict[str, Any] = {"is_success": bool(outcome.success[0]), "diverged": bool(diverged[0])}
-        info["reward_terms"] = {name: float(term[0]) for name, term in outcome.terms.items()}
-        return self.task.observe(self.simulation)[0], float(outcome.reward[0]), False, bool(diverged[0]), info
+        if not diverged:  # else the state is that of MuJoCo's own reset
+            self._observation = self.task.observe(self.simulation)[0]
+        info: dict[str, Any] = {"is_success": bool(outcome.success[0]) and not diverged, "diverged": diverged}
+        info["reward_terms"] = {name: 0.0 if diverged else float(term[0]) for name, term in outcome.terms.items()}
+        reward = 0.0 if diverged else float(outcome.reward[0])
+        return self._observation.copy(), reward, False, diverged, info
 
     def render(self) -> Any:
         """An image (height, width, 3) for "rgb_array"; a window for "human". RuntimeError where OpenGL is missing."""

@@ -22,6 +22,8 @@ from simopt_envs.tasks.task import Task
 Worlds = NDArray[np.intp]
 Backend = Literal["mujoco", "warp"]
 
+_HORIZON = 50  # steps of the two tasks' episodes
+
 
 class TaskVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
     """n worlds of a task, on the threads of MuJoCo or on MuJoCo Warp.
@@ -41,11 +43,16 @@ class TaskVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
     Args:
         task: the task.
         num_envs: n.
-        max_episode_steps: steps after which an episode is truncated.
+        max_episode_steps: steps after which an episode is truncated; -1 for no limit, None for the tasks' 50.
         autoreset_mode: when a world that is done is reset, as Gymnasium defines it.
         num_threads: of "mujoco"; 0 for one per core.
         backend: "mujoco", or "warp" for MuJoCo Warp.
         device: of "warp": "cuda:0", "cpu", ...; None for the first GPU, or the CPU where there is none.
+        render_mode: None, as it does not render; there for callers that always name one.
+
+    Raises:
+        ValueError: for an argument that is out of range; by ``reset``, for an option or parameter it does not know or
+            cannot take; by ``step``, for actions of another shape or that are not finite.
 
     Attributes:
         parameter_source: called with the ids (k,) of worlds that begin an episode without explicit parameters, at
@@ -56,14 +63,23 @@ class TaskVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         self,
         task: Task,
         num_envs: int = 1,
-        max_episode_steps: int = 50,
+        max_episode_steps: int | None = _HORIZON,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         num_threads: int = 0,
         backend: Backend = "mujoco",
         device: str | None = None,
+        render_mode: None = None,
     ):
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, got {num_envs}")
+        max_episode_steps = _HORIZON if max_episode_steps is None else max_episode_steps
+        if max_episode_steps < 1 and max_episode_steps != -1:
+            raise ValueError(f"max_episode_steps must be at least 1, or -1 for no limit, got {max_episode_steps}")
+        if render_mode is not None:
+            raise ValueError(
+                f"the native vector environment does not render: render_mode must be None, got {render_mode!r}; "
+                'use vectorization_mode="sync"'
+            )
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.task = task
         self.num_envs = num_envs
@@ -100,6 +116,7 @@ class TaskVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         mask = options.pop("reset_mask", None)
         worlds = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask)
         explicit = episode_parameters(self.parameters, options, self.num_envs)
+        given = options.get("parameters") is not None
         seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int | np.integer) else seed
         if seeds is not None:
             if len(seeds) != self.num_envs:
@@ -107,15 +124,19 @@ class TaskVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
             for world in worlds.tolist():
                 if seeds[world] is not None:
                     self._rngs[world] = np_random(seeds[world])[0]
-        self._begin(worlds, explicit[worlds] if "parameters" in options else None, options.get("initial_observation"))
+        self._begin(worlds, explicit[worlds] if given else None, options.get("initial_observation"))
         return deepcopy(self._observation), {"parameters": self._xi.copy()}
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Advance every world by ``dt``; worlds that are done are reset as ``autoreset_mode`` says."""
         xp = namespace(self._observation)
-        actions = xp.clip(self.simulation.asarray(actions), -1.0, 1.0)
+        actions = self.simulation.asarray(actions)
         if actions.shape != self.action_space.shape:
             raise ValueError(f"actions must have shape {self.action_space.shape}, got {actions.shape}")
+        if not xp.isfinite(actions).all():
+            world = _which(~xp.isfinite(actions).all(axis=1))[0]
+            raise ValueError(f"the action of world {world} is not finite: {actions[world]}")
+        actions = xp.clip(actions, -1.0, 1.0)
         beginning = self._done  # with NEXT_STEP, these worlds spend this step on their reset
         if self.autoreset_mode is AutoresetMode.DISABLED and beginning.any():
             raise RuntimeError(f"worlds {_which(beginning).tolist()} are done; reset them (options['reset_mask'])")
@@ -130,7 +151,8 @@ class TaskVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         self._steps += 1
         self.diverged_count += int(diverged.sum())
 
-        truncated = (diverged | (self._steps >= self.max_episode_steps)) & ~beginning
+        over = (self._steps >= self.max_episode_steps) & (self.max_episode_steps != -1)
+        truncated = (diverged | over) & ~beginning
         info: dict[str, Any] = {
             "is_success": success,
             "diverged": diverged,

@@ -51,6 +51,7 @@ class DrawerTask:
     discrepancy_weights = np.array([0.5] * 7 + [1.0] * 3)
 
     def __init__(self, effects: Effects = ()) -> None:
+        self._effects = tuple(effects)
         self._spec = _scene()
         added = add_effects(self._spec, effects)
         model = self._nominal = self.make_model()
@@ -67,6 +68,9 @@ class DrawerTask:
         self._grasp, self._handle = model.site("grasp").id, model.site("handle").id
         self._fingers = [model.joint(name).qposadr[0] for name in ("finger_left", "finger_right")]
         self._bar_radius, self._bar_half_length = model.geom("handle").size[:2].tolist()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self._effects,)  # a copy is built anew: an MjSpec cannot be pickled
 
     def make_spec(self) -> mujoco.MjSpec:
         """See :meth:`Task.make_spec`."""

@@ -27,6 +27,9 @@ def make_env(effects: Effects = (), **kwargs: Any) -> TaskEnv:
     return TaskEnv(SwingPegTask(effects), **kwargs)
 
 
+vars(make_env)["metadata"] = TaskEnv.metadata  # where gym.make looks for the render modes
+
+
 def make_vector_env(effects: Effects = (), **kwargs: Any) -> TaskVectorEnv:
     """The native vector environment; physical effects, and keywords of :class:`TaskVectorEnv`."""
     return TaskVectorEnv(SwingPegTask(effects), **kwargs)

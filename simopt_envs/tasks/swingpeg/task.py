@@ -53,6 +53,7 @@ class SwingPegTask:
     discrepancy_weights = np.array([0.5] * 7 + [1.0] * 3)
 
     def __init__(self, effects: Effects = ()) -> None:
+        self._effects = tuple(effects)
         self._spec = make_spec()
         added = add_effects(self._spec, effects)
         model = self.make_model()
@@ -73,6 +74,9 @@ class SwingPegTask:
         self._scratch.reset(_WORLD, qpos, np.zeros((1, model.nv)), self.hold(qpos))
         start, _ = self._measures(self._scratch)
         self._start = {name: float(start[name][0]) for name in ("distance_l1", "distance_l2", "angle")}
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self._effects,)  # a copy is built anew: an MjSpec cannot be pickled
 
     def make_spec(self) -> mujoco.MjSpec:
         """See :meth:`Task.make_spec`."""

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from baselines.commands.inputs import is_number, read_text
-from simopt_envs.distributions import Gaussian
+from simopt_envs.distributions.gaussian import Gaussian
 from simopt_envs.physics import Parameter, ParameterSpace, Write
 from simopt_envs.physics.parameters import unknown_name
 
@@ -48,6 +48,18 @@ def read_parameters(path: Path) -> Gaussian:
             name = entry.get("name") if isinstance(entry, dict) else None
             raise ValueError(f"{path}, parameter {name or i + 1}: {error}") from None
     return Gaussian.around_nominal(ParameterSpace(parameters), stds)
+
+
+def read_text(path: Path, what: str) -> str:
+    """Content of a file; FileNotFoundError saying what it would have been."""
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no {what} {path}")
+    return path.read_text(encoding="utf-8")
+
+
+def is_number(value: Any) -> bool:
+    """Whether a value read from JSON or YAML is a finite number."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def _parameter(entry: Any) -> Parameter:
