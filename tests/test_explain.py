@@ -16,11 +16,12 @@ from rich.console import Console
 
 from baselines.cli import main
 from baselines.commands import inputs
-from baselines.commands.gap import environment, explain
+from baselines.commands.gap import explain
 from baselines.commands.gap_demo import _joined
 from baselines.logged_system import LoggedSystem
 from simopt_envs.adaptation import EnvSimulator
 from simopt_envs.distributions import Gaussian
+from simopt_envs.gap.environments import environment
 from simopt_envs.gap.find import find_gap, solve
 from simopt_envs.measured import Finding, Recording, load_recording
 from simopt_envs.physics import ModelWriter

@@ -102,6 +102,7 @@ def test_from_episodes_of_gymnasiums_reacher_to_its_repair(tmp_path, monkeypatch
     assert repaired.joint("joint0").frictionloss[0] == 0
 
 
+@needs_effects
 def test_an_environment_without_an_mjcf_file_is_told(tmp_path, capsys):
     log = tmp_path / "log.csv"
     log.write_text("time,qpos/a\n0,0\n0.1,0\n")

@@ -44,7 +44,7 @@ def plot_recording(
             linewidth=0.8,
             drawstyle="steps-post" if name.startswith("ctrl/") else "default",
         )
-        axis.set_ylabel(f"{name}\n[{units[name] or '1'}]" if name in units else name, fontsize=8)
+        axis.set_ylabel(f"{name}\n[{units[name]}]" if units.get(name) else name, fontsize=8)
     axes[-1].plot(recording.time[1:], 1e3 * np.diff(recording.time), ".", markersize=2, color="tab:gray")
     axes[-1].set_ylabel("interval [ms]", fontsize=8)
     axes[-1].set_xlabel("time [s]")
