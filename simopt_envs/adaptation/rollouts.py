@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from gymnasium.vector import VectorEnv
+from gymnasium.vector import VectorEnv, VectorWrapper
 from numpy.typing import NDArray
 
 from simopt_envs.adaptation.protocols import Policy
@@ -134,3 +134,33 @@ def run_episodes(
     if success is not None:
         success = np.where(ended, success, np.nan)
     return Rollouts(np.stack(observations, 1), np.stack(actions, 1), lengths, diverged, success)
+
+
+class Counted(VectorWrapper):
+    """Reports the control steps taken in a vector environment."""
+
+    def __init__(self, env: VectorEnv, count: Callable[[int], None]):
+        super().__init__(env)
+        self._count = count
+
+    def step(self, actions: Any) -> Any:
+        """As the environment's."""
+        self._count(self.num_envs)
+        return self.env.step(actions)
+
+
+def require_measured(real: Sequence[Trajectory], names: Sequence[str]) -> None:
+    """ValueError unless there are episodes, with channels of these names, that simulations can start from."""
+    if not real:
+        raise ValueError("the real system returned no trajectory")
+    for i, trajectory in enumerate(real):
+        if trajectory.observations.shape[1] != len(names):
+            raise ValueError(
+                f"real trajectory {i} has {trajectory.observations.shape[1]} observed channels, the simulator"
+                f" {len(names)}: {', '.join(names)}"
+            )
+        if not np.isfinite(trajectory.observations[0]).all():
+            raise ValueError(
+                f"real trajectory {i} has no complete first observation, which simulations start from: "
+                f"{trajectory.observations[0]}"
+            )

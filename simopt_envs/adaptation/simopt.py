@@ -12,12 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from gymnasium.vector import VectorEnv, VectorWrapper
+from gymnasium.vector import VectorEnv
 
 from simopt_envs.adaptation.checkpoint import Checkpoint, Content, Result, identity
 from simopt_envs.adaptation.discrepancy import Discrepancy, Verdict, judge
 from simopt_envs.adaptation.protocols import EvaluableSystem, PersistentTrainer, Policy, RealSystem, Trainer
 from simopt_envs.adaptation.records import Event, Iteration, pack_trajectories, unpack_trajectories
+from simopt_envs.adaptation.rollouts import Counted, require_measured
 from simopt_envs.adaptation.search import (
     is_better_further_out,
     is_stuck,
@@ -222,7 +223,7 @@ class SimOpt:
             steps += stepped
 
         def make_vector_env(num_envs: int) -> VectorEnv:
-            return _Counted(self.simulator.make_vector_env(num_envs, distribution, int(worlds.integers(2**31))), count)
+            return Counted(self.simulator.make_vector_env(num_envs, distribution, int(worlds.integers(2**31))), count)
 
         def compute() -> Content:
             nonlocal policy
@@ -254,7 +255,7 @@ class SimOpt:
 
         def roll_out() -> Content:
             real = self.real_system.rollout(policy, self.real_rollouts, random)  # type: ignore[arg-type]
-            _check_measured(real, self.simulator.observation_names)
+            require_measured(real, self.simulator.observation_names)
             return pack_trajectories(real)
 
         real = unpack_trajectories(self._phase(checkpoint, k, "real", roll_out))
@@ -386,18 +387,6 @@ class SimOpt:
         }
 
 
-class _Counted(VectorWrapper):
-    """Reports the control steps taken in a vector environment."""
-
-    def __init__(self, env: VectorEnv, count: Callable[[int], None]):
-        super().__init__(env)
-        self._count = count
-
-    def step(self, actions: Any) -> Any:
-        self._count(self.num_envs)
-        return self.env.step(actions)
-
-
 def _number(stored: np.ndarray) -> float | None:
     """A number that a phase stored, NaN for None."""
     return None if np.isnan(stored) else float(stored)
@@ -405,19 +394,3 @@ def _number(stored: np.ndarray) -> float | None:
 
 def _name(k: int, phase: str) -> str:
     return f"{k:03d}_{phase}"
-
-
-def _check_measured(real: Sequence[Trajectory], names: Sequence[str]) -> None:
-    if not real:
-        raise ValueError("the real system returned no trajectory")
-    for i, trajectory in enumerate(real):
-        if trajectory.observations.shape[1] != len(names):
-            raise ValueError(
-                f"real trajectory {i} has {trajectory.observations.shape[1]} observed channels, the simulator"
-                f" {len(names)}: {', '.join(names)}"
-            )
-        if not np.isfinite(trajectory.observations[0]).all():
-            raise ValueError(
-                f"real trajectory {i} has no complete first observation, which simulations start from: "
-                f"{trajectory.observations[0]}"
-            )
