@@ -24,7 +24,7 @@ from simopt_envs.gap.presence import is_there
 from simopt_envs.gap.refit import Refit, grown
 from simopt_envs.gap.screen import made_by_probes, screen
 from simopt_envs.gap.search import Search
-from simopt_envs.gap.selection import score_of
+from simopt_envs.gap.selection import score_of, worth_of
 from simopt_envs.gap.thresholds import EVIDENCE, LARGE, PROBED_LARGER
 from simopt_envs.gap.trial import Base
 from simopt_envs.physics.effects import EFFECTS
@@ -139,6 +139,21 @@ def test_the_sensors_noise_is_told_with_what_explains_errors_that_looked_like_it
     np.testing.assert_allclose(after, expected, rtol=0.01)
 
 
+@pytest.mark.parametrize("push", [0.0, 2.0])
+def test_what_errors_are_counted_in_is_what_is_left_of_them_counted_so(push):
+    """Of a model that is far off, starts do not explain most of it; of a right one noise alone is left."""
+    search = _search(lambda q, v: np.array([push, 0.0]), (PUSH,))
+    base = search.base()
+    tolerance = search._tolerance_of(base)
+    assert np.all(tolerance == 1) == (push == 0), tolerance
+    misfit = Misfit(base.hypothesis, search.data.held_out)
+    counted = misfit.with_noise(misfit.noise_at(base.fit.u, tolerance * base.sensor_noise))
+    left = 1 / np.sqrt(worth_of(tolerance * counted.errors(base.fit.u[None])[0]))
+    assert left == pytest.approx(tolerance, rel=0.08)
+    beside_sensors_noise = 1 / np.sqrt(worth_of(base.held_out.errors))
+    assert np.any(beside_sensors_noise < 0.9 * tolerance) == (push > 0), (beside_sensors_noise, tolerance)
+
+
 def test_a_fit_does_not_end_in_the_period_that_its_best_start_is_near():
     """Cogging with 21 periods per radian: of all probes' starts, the nearest to the data leads to 22."""
     hidden = lambda q, v: np.array([0.0, -0.5 * np.tanh(v[1] / 0.01) - 0.1 * np.sin(21 * q[1] + 1.0)])  # noqa: E731
@@ -244,9 +259,13 @@ def test_windows_that_no_fit_saw_may_tell_that_an_effect_is_there(friction):
     assert is_there(base.hypothesis, DRY, *base.by_all(search.data)) == (friction > 0)
 
 
+@pytest.mark.parametrize("dropped", [frozenset(), frozenset({DRY})])
 @pytest.mark.parametrize(("around_rest", "right"), [(-0.5, DRY), (1.5, PEAKED)])
-def test_an_effect_gives_way_to_the_one_that_it_extends_if_what_it_adds_is_not_there(around_rest, right):
-    """Less friction of the elbow at low speed, or more, and a spring; by its gain, the one extended was no rival."""
+def test_an_effect_gives_way_to_the_one_that_it_extends_if_what_it_adds_is_not_there(around_rest, right, dropped):
+    """Less friction of the elbow at low speed, or more, and a spring; by its gain, the one extended was no rival.
+
+    Or it was one, and gave way when the spring was missing yet.
+    """
 
     def hidden(q: np.ndarray, v: np.ndarray) -> np.ndarray:
         friction = (0.5 + around_rest * np.exp(-((v[1] / 0.3) ** 2))) * np.tanh(v[1] / 0.01)
@@ -255,7 +274,7 @@ def test_an_effect_gives_way_to_the_one_that_it_extends_if_what_it_adds_is_not_t
     search = _search(hidden, (SPRING, DRY, PEAKED))
     stage = search.stage(search.base())
     without = ranked(stage.base, stage.screened, {c: trial for c, trial in stage.trials.items() if c != DRY})
-    final, effects = search._revised(search.base((PEAKED, SPRING)), [without])
+    final, effects = search._revised(search.base((PEAKED, SPRING)), [without], dropped)
     assert {*final.hypothesis.candidates} == {right, SPRING} == {score.candidate for score in effects}
 
 

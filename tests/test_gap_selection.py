@@ -17,7 +17,7 @@ from simopt_envs.gap.predictive import HeldOut
 from simopt_envs.gap.presence import is_told_from_none, may_be_itself
 from simopt_envs.gap.recordings import split
 from simopt_envs.gap.result import judge
-from simopt_envs.gap.selection import Score, chosen, is_all, tolerance_of
+from simopt_envs.gap.selection import Score, chosen, is_all, worth_of
 from simopt_envs.gap.trial import Base
 from simopt_envs.measured import Recording
 from simopt_envs.physics.effects import EFFECTS
@@ -240,13 +240,12 @@ def _explanation(
     return SimpleNamespace(null=base(fitted, held_out), final=base(then_fitted, then), effects=("one",), data=data)
 
 
-def test_errors_count_in_what_is_left_only_where_that_is_far_more_than_noise():
-    rng = np.random.default_rng(0)
-    noise = rng.normal(size=(8, 26, 2))
-    right: Any = SimpleNamespace(held_out=SimpleNamespace(errors=noise))
-    np.testing.assert_array_equal(tolerance_of(right), 1.0)
-    astray: Any = SimpleNamespace(held_out=SimpleNamespace(errors=noise * np.array([1.0, 20.0])))
-    assert tolerance_of(astray) == pytest.approx([1.0, 20.0], rel=0.1)
+def test_what_errors_are_worth_is_what_is_left_where_that_is_more_than_noise():
+    noise = np.random.default_rng(0).normal(size=(8, 26, 2))
+    assert worth_of(noise) == pytest.approx([1.0, 1.0], rel=0.2)
+    assert worth_of(noise * np.array([1.0, 20.0])) == pytest.approx([1.0, 20.0**-2], rel=0.2)
+    alike = np.repeat(noise[:, :1], 26, axis=1)
+    assert worth_of(20 * alike) == pytest.approx(1 / (26 * 400 * np.mean(noise[:, 0] ** 2, axis=0)))
 
 
 @pytest.mark.parametrize(

@@ -59,7 +59,7 @@ def ranked(base: Base, screened: Sequence[Screened], trials: Mapping[Candidate, 
         return trial.fit.loss + 0.5 * float(np.sum((told.errors / base.tolerance) ** 2) + np.sum(told.log_det))
 
     best = min(trials.values(), key=loss)
-    worth = worth_of(best)
+    worth = worth_of(best.held_out.errors)
     scores = [score_of(base, candidate, trial, worth) for candidate, trial in trials.items()]
     return Stage(base, tuple(screened), tuple(sorted(scores, key=lambda score: -score.total)))
 

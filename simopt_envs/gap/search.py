@@ -78,7 +78,9 @@ class Search:
         """Add effects while they earn it, then take away those that the others have made needless."""
         base = self._null or self.base()
         stage = self._first(self._in_longer_windows(base))
-        self._tolerance = tolerance_of(min((score.trial for score in stage.scores), key=lambda trial: trial.excess))
+        self._tolerance = self._tolerance_of(
+            min((score.trial for score in stage.scores), key=lambda trial: trial.excess)
+        )
         if np.any(self._tolerance > 1):  # only now it is known that nothing comes near the sensors' noise
             stage = self.stage(self.base(start=self._led_to(stage)))
         stages: list[Stage] = []
@@ -167,8 +169,12 @@ class Search:
         self._tolerance = np.ones(len(self._tolerance))
         base = self.base(effects, usual(trial.fit.u))
         best = min(trial, base, key=lambda t: t.excess)
-        self._tolerance = tolerance_of(best)
+        self._tolerance = self._tolerance_of(best)
         return self.base(effects, usual(best.fit.u)) if np.any(self._tolerance > 1) else base
+
+    def _tolerance_of(self, best: Trial) -> Array:
+        """What errors are to be counted in where no trial comes nearer to the data, (c,)."""
+        return tolerance_of(best, self.data.held_out, self._floor)
 
     def _look(self, base: Base) -> Stage | None:
         """A stage of those candidates alone that come nearest to the data at some size.
@@ -342,7 +348,7 @@ class Search:
         of it" goes as well, unless it is so strong that its size shows little: the evidence for it is of a few
         stretches, and others speak against it. So does one that is not what its name means. What did well beside it may
         take its place, and others then be added. One of which that holds for what it adds to the effect that it extends
-        gives way to that. What was dropped does not come back.
+        gives way to that. What was dropped does not come back, but so.
         """
         effects, earned = base.hypothesis.candidates, []
         if not effects:
@@ -350,11 +356,11 @@ class Search:
         hypothesis, (u, spread) = base.hypothesis, base.by_all(self.data)
         itself = {effect: may_be_itself(hypothesis, effect, u, spread) for effect in effects}
         for effect in sorted(effects, key=itself.__getitem__):  # beside what is none, another may only seem needless
-            told, smaller = (hypothesis, effect, u, spread), extended(effect, {*self.candidates} - dropped - {*effects})
+            told, smaller = (hypothesis, effect, u, spread), extended(effect, {*self.candidates} - {*effects})
             if smaller is not None and not (itself[effect] and is_there(*told, smaller)):
                 return self._revised(self._reduced(base, effect, smaller), stages, dropped | {effect})
             without = self._without(base, effect, stages)
-            score = score_of(without, effect, base, worth_of(base))
+            score = score_of(without, effect, base, worth_of(base.held_out.errors))
             there = is_there(*told) or is_told_from_none(effect, base, without, self.data.parts)
             stays = score.needed and itself[effect] and there
             rivals = rivals_of(effect, stays, without, stages) - dropped - {*effects}

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simopt_envs.gap.fit import Fit
+from simopt_envs.gap.fit import Fit, Misfit
 from simopt_envs.gap.hypothesis import Candidate
 from simopt_envs.gap.plain import SPEAKS_FOR
 from simopt_envs.gap.thresholds import (
@@ -23,7 +23,10 @@ from simopt_envs.gap.thresholds import (
     SIMPLER_SHARE,
 )
 from simopt_envs.gap.trial import Base, Trial, noise_alone
+from simopt_envs.measured.windows import Windows
 from simopt_envs.physics.parameters import Array
+
+_ROUNDS, _ALIKE = 10, 0.05  # of which a tolerance is told at most, and how much it may still change
 
 
 @dataclass(frozen=True)
@@ -122,25 +125,38 @@ def is_all(null: Base, base: Base) -> bool:
     return quiet and base.excess - FURTHER * (null.excess - base.excess) < -noise
 
 
-def worth_of(best: Trial) -> Array:
-    """What a squared error of 1 is worth in each channel, (c,): 1 where the best model leaves noise alone.
+def worth_of(errors: Array) -> Array:
+    """What a squared error of 1 is worth in each channel, (c,), by what the best model leaves, (w, S, c): 1 if noise.
 
     Where it leaves more, the errors are larger than the noise and go together within a window: that many fewer count.
     """
-    errors = best.held_out.errors
     mean_square = np.mean(errors**2, axis=(0, 1))
     of_means = np.mean(errors.mean(axis=1) ** 2, axis=0)
     alike = np.clip(errors.shape[1] * of_means / np.maximum(mean_square, 1e-12), 1.0, errors.shape[1])
     return 1 / np.maximum(mean_square * np.where(mean_square > EXPLAINED, alike, 1.0), 1.0)
 
 
-def tolerance_of(best: Trial) -> Array:
+def tolerance_of(best: Trial, held_out: Windows, sensor_noise: Array) -> Array:
     """What errors are to be counted in, in units of the sensors' noise, (c,).
 
-    That is 1 or, where even the best model leaves far more in some channel, what it leaves, by what that is worth.
+    That is 1 or, where even the best model leaves far more in some channel, what it leaves, by what that is worth. The
+    larger that is, the less of it can be of uncertain starts, so that it is told until it stays the same.
+
+    Args:
+        best: the model.
+        held_out: the windows that it is judged by.
+        sensor_noise: standard deviation of each channel's, (c,).
     """
-    coarse = np.sqrt(np.mean(best.held_out.errors**2, axis=(0, 1))) > COARSE
-    return 1 / np.sqrt(worth_of(best)) if coarse.any() else np.ones(len(coarse))
+    tolerance = np.ones(len(sensor_noise))
+    if np.all(np.sqrt(np.mean(best.held_out.errors**2, axis=(0, 1))) <= COARSE):
+        return tolerance
+    misfit, u = Misfit(best.hypothesis, held_out), best.fit.u
+    for _ in range(_ROUNDS):
+        noise = misfit.noise_at(u, tolerance * sensor_noise)
+        before, tolerance = tolerance, 1 / np.sqrt(worth_of(tolerance * misfit.with_noise(noise).errors(u[None])[0]))
+        if np.allclose(tolerance, before, rtol=_ALIKE):
+            break
+    return tolerance
 
 
 def score_of(base: Base, candidate: Candidate, trial: Trial, worth: Array) -> Score:

@@ -36,7 +36,8 @@ def of_best_length(
 ) -> Base:
     """A base, or the same with the ξ that shorter windows give, if that predicts what was held out better.
 
-    By as many nats as are evidence for an effect.
+    By as many nats as are evidence for an effect, as shorter windows tell less of a law of the right form. Where errors
+    count in what even the best model leaves, no law is, and any better is enough.
 
     Args:
         base: fitted to the data.
@@ -55,9 +56,10 @@ def of_best_length(
         if windows is not None:
             found.append(_fitted(base, windows, fit))
     left = 0.5 * np.sum(test.errors(np.array(found)) ** 2, axis=(1, 2, 3))
-    if left[0] - left.min() < EVIDENCE:
+    best = int(np.argmin(left))
+    if best == 0 or (left[0] - left[best] < EVIDENCE and np.all(base.tolerance == 1)):
         return base
-    u = found[int(np.argmin(left))]
+    u = found[best]
     there = Fit(u, misfit.errors(u[None])[0], misfit.jacobian(u), base.fit.prior_std, misfit.noise.log_det)
     return replace(base, fit=there, held_out=HeldOut.of(test, u, base.tolerance))
 

@@ -39,7 +39,9 @@ cases of the swing-peg of seeds 30000), and fits in full keep derivatives by wha
 Since seeds 34000 had, ``FROM_REST`` is new.
 Since seeds 37000 had, ``OF_TIMESTEP`` is new (Gymnasium's half cheetah, in recordings of half its timestep in which
 nothing was hidden, had been given four names), and what is so strong that its interval holds none may be told from none
-all the same (``gap/presence.py``; a friction in a rope of the tests).
+all the same (``gap/presence.py``; a friction in a rope of the tests). Then, after the double pendulum of
+``benchmarks/measured.py``, what ``COARSE`` has errors counted in was told until it stays the same, and there shorter
+windows need no ``EVIDENCE`` any more (EMPS of it).
 
 What fitted values must be for an effect's name to fit them is with the effects (``Effect.is_itself``): that a cogging
 shows a whole period is asked since seeds 20000 had been run (one case, and one of the gap demonstration).
@@ -47,7 +49,7 @@ shows a whole period is asked since seeds 20000 had been run (one case, and one 
 
 EVIDENCE = 20.0
 """Nats that an effect must earn on the windows fitted and on those held out together; on the latter alone, shorter
-windows for sizes to be theirs."""
+windows for sizes to be theirs, unless errors count in what is left (``gap/sizes.py``)."""
 
 EVIDENCE_EACH = 5.0
 """Nats that it must earn on either, unless those on the windows held out are as many as are asked of both, or those on
