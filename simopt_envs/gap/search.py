@@ -348,7 +348,7 @@ class Search:
         of it" goes as well, unless it is so strong that its size shows little: the evidence for it is of a few
         stretches, and others speak against it. So does one that is not what its name means. What did well beside it may
         take its place, and others then be added. One of which that holds for what it adds to the effect that it extends
-        gives way to that. What was dropped does not come back, but so.
+        gives way to that, which may have been dropped. In no other way does what was dropped come back.
         """
         effects, earned = base.hypothesis.candidates, []
         if not effects:
